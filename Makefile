@@ -1,0 +1,24 @@
+# The environment is .venv at the root; every target brings it up to date first (at once when nothing has changed).
+BIN := .venv/bin
+
+.PHONY: setup demo test lint lock
+
+setup:
+	@sh scripts/setup
+
+demo: setup
+	$(BIN)/dtprob demo --out out/demo
+
+test: setup
+	$(BIN)/python -m pytest
+
+lint: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/pyright
+	$(BIN)/lint-imports
+
+# Resolve the dependencies of pyproject.toml anew (needs uv).
+lock:
+	uv pip compile pyproject.toml --all-extras --group dev --universal --python-version 3.12 --generate-hashes \
+	    --no-emit-index-url --custom-compile-command "make lock" --quiet --output-file requirements.lock
