@@ -1,0 +1,39 @@
+"""Files that are either there whole or not at all."""
+
+import os
+import secrets
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+
+
+@contextmanager
+def atomic_write(path: str | os.PathLike[str]) -> Generator[Path]:
+    """Give a temporary path beside ``path``; on success it replaces ``path`` in one step.
+
+    When the body raises (or the process is killed) ``path`` keeps its earlier content. Missing parent
+    directories are made. The temporary path keeps the suffix of ``path``, so that writers which look
+    at the suffix choose the same format.
+
+    Args:
+        path: the file to write.
+
+    Yields:
+        the path that the body writes to; it exists and is empty.
+    """
+    target = Path(path)
+    target.parent.mkdir(parents=True, exist_ok=True)
+    temporary = target.with_name(f".{target.stem}-{secrets.token_hex(4)}{target.suffix}")
+    temporary.touch(exist_ok=False)
+    try:
+        yield temporary
+        _flush(temporary)
+        temporary.replace(target)
+    finally:
+        temporary.unlink(missing_ok=True)
+
+
+def _flush(path: Path) -> None:
+    """Bring the content to disk before the name points at it."""
+    with path.open("rb") as stream:
+        os.fsync(stream.fileno())

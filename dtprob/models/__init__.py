@@ -1,0 +1,1 @@
+"""The declared generative models, and what they share."""

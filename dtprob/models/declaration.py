@@ -1,0 +1,293 @@
+"""What a declared model says of itself: its sites, its axes, its arguments.
+
+A model is a plain NumPyro function. Nothing has to be registered: running it once under a trace tells which sites it
+samples, computes and observes. The decorator `model` only adds names for axes that no plate names.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, cast
+
+import equinox as eqx
+import jax
+import numpy as np
+import numpyro
+from numpyro import handlers
+from numpyro.distributions import constraints
+
+from dtprob.errors import InputError, nearest
+
+type Model = Callable[..., Any]
+type Data = Mapping[str, Any]
+type Kind = Literal["latent", "deterministic", "observed"]
+
+_METADATA = "__dtprob__"
+
+
+@dataclass(frozen=True)
+class Metadata:
+    """What a model's author says beyond the function: axis names per site, coordinates per axis, the cluster axis."""
+
+    axes: Mapping[str, tuple[str, ...]]
+    cluster: str | None
+
+
+@dataclass(frozen=True)
+class Site:
+    """One named site of a model.
+
+    Attributes:
+        name: the site's name.
+        kind: "latent", "deterministic" or "observed".
+        shape: shape of the site's value.
+        axes: one name per dimension of the value.
+        plates: the names of the plates that the site lies in.
+        support: the distribution's support; None for a deterministic site.
+        distribution: the name of the distribution's class; None for a deterministic site.
+        argument: for an observed site, the model's argument that holds its value.
+    """
+
+    name: str
+    kind: Kind
+    shape: tuple[int, ...]
+    axes: tuple[str, ...]
+    plates: tuple[str, ...]
+    is_complex: bool = False
+    support: constraints.Constraint | None = None
+    distribution: str | None = None
+    argument: str | None = None
+
+    @property
+    def is_circular(self) -> bool:
+        """Whether the site's values are angles in (-pi, pi]."""
+        return base_constraint(self.support) is constraints.circular
+
+    @property
+    def size(self) -> int:
+        """Number of entries of the site's value."""
+        return int(np.prod(self.shape, dtype=int))
+
+
+@dataclass(frozen=True)
+class Declaration:
+    """The sites and axes of a model on given data, in the order of execution."""
+
+    name: str
+    sites: Mapping[str, Site]
+    cluster: str | None
+
+    def of_kind(self, kind: Kind) -> dict[str, Site]:
+        """The sites of one kind, by name."""
+        return {name: site for name, site in self.sites.items() if site.kind == kind}
+
+    @property
+    def latent(self) -> dict[str, Site]:
+        """The sites that inference finds."""
+        return self.of_kind("latent")
+
+    @property
+    def deterministic(self) -> dict[str, Site]:
+        """The named intermediates, on which effects act."""
+        return self.of_kind("deterministic")
+
+    @property
+    def observed(self) -> dict[str, Site]:
+        """The sites with data."""
+        return self.of_kind("observed")
+
+
+def base_constraint(support: constraints.Constraint | None) -> constraints.Constraint | None:
+    """The constraint of a single entry, without the wrappers of independent dimensions."""
+    while support is not None and hasattr(support, "base_constraint"):
+        support = cast("constraints.Constraint", support.base_constraint)  # pyright: ignore
+    return support
+
+
+def model(
+    *, axes: Mapping[str, Sequence[str]] | None = None, cluster: str | None = None
+) -> Callable[[Model], Model]:
+    """Decorator that names what plates cannot: the axes of deterministic and event dimensions.
+
+    Args:
+        axes: for a site, the names of all its dimensions, first to last.
+        cluster: the axis whose entries are independent of one another (a plate's name); by default the first plate.
+    """
+    metadata = Metadata({name: tuple(names) for name, names in (axes or {}).items()}, cluster)
+
+    def mark(function: Model) -> Model:
+        setattr(function, _METADATA, metadata)
+        return function
+
+    return mark
+
+
+def metadata(function: Model) -> Metadata:
+    """The metadata of a model, empty where its author gave none."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return getattr(function, _METADATA, Metadata({}, None))
+
+
+def model_name(function: Model) -> str:
+    """The model's name in reports and files."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def select_arguments(function: Model, data: Data) -> dict[str, Any]:
+    """The entries of `data` that the model takes, checked against its signature.
+
+    Raises:
+        InputError: a required argument is missing, or the data has an entry that the model does not take.
+    """
+    parameters = inspect.signature(function).parameters
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    for name in data:
+        if name not in parameters and not takes_any:
+            hint = nearest(name, parameters)
+            raise InputError(
+                f"data for {model_name(function)}",
+                f"arguments among {', '.join(parameters)}",
+                repr(name),
+                f"Did you mean {hint!r}?" if hint else "Remove it, or add the argument to the model.",
+            )
+    for name, parameter in parameters.items():
+        if parameter.default is parameter.empty and parameter.kind not in (
+            parameter.VAR_KEYWORD,
+            parameter.VAR_POSITIONAL,
+        ):
+            if name not in data:
+                raise InputError(
+                    f"data for {model_name(function)}",
+                    f"an entry {name!r}",
+                    ", ".join(data) or "nothing",
+                    f"Give {name!r}, or a default in the model.",
+                )
+    return dict(data)
+
+
+def split_static(data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Data as (arrays, everything else), so that arrays can be arguments of compiled functions."""
+    arrays, static = eqx.partition(dict(data), eqx.is_array_like)
+    return cast("dict[str, Any]", arrays), cast("dict[str, Any]", static)
+
+
+def trace_model(
+    function: Model, data: Data, key: jax.Array, substitute: Mapping[str, Any] | None = None
+) -> dict[str, Any]:
+    """One execution of the model: the NumPyro trace, latent sites drawn from the prior unless substituted."""
+    seeded = handlers.seed(function, key)
+    replaced = handlers.substitute(seeded, data=dict(substitute or {}))
+    return handlers.trace(replaced).get_trace(**data)
+
+
+def declare(function: Model, data: Data, *, cluster: str | None = None) -> Declaration:
+    """Run the model once, abstractly, and tell its sites and axes.
+
+    Args:
+        function: a NumPyro model; its arguments are the data's entries by name.
+        data: arrays and settings by argument name; the observed ones present.
+        cluster: overrides the model's own cluster axis.
+
+    Raises:
+        InputError: the data do not match the model's arguments, or the model observes nothing.
+    """
+    data = select_arguments(function, data)
+    notes = metadata(function)
+    found: dict[str, Site] = {}
+
+    def run(arrays: dict[str, Any], key: jax.Array) -> None:
+        full = eqx.combine(arrays, static)
+        trace = trace_model(function, full, key)
+        for name, message in trace.items():
+            site = _site(message, notes, full)
+            if site is not None:
+                found[name] = site
+
+    arrays, static = split_static(data)
+    jax.eval_shape(run, arrays, jax.random.key(0))
+    declaration = Declaration(model_name(function), found, cluster or notes.cluster or _first_plate(found))
+    if not declaration.observed:
+        raise InputError(
+            f"model {declaration.name}",
+            "an observed site",
+            "none",
+            "Pass the observed data, and give it to numpyro.sample as obs.",
+        )
+    return declaration
+
+
+def _first_plate(sites: Mapping[str, Site]) -> str | None:
+    for site in sites.values():
+        if site.kind == "observed" and site.plates:
+            return site.axes[0] if site.axes and site.axes[0] in site.plates else site.plates[0]
+    return None
+
+
+def _site(message: Mapping[str, Any], notes: Metadata, data: Data) -> Site | None:
+    if message["type"] == "deterministic":
+        kind: Kind = "deterministic"
+    elif message["type"] == "sample" and isinstance(message["fn"], numpyro.distributions.Distribution):
+        kind = "observed" if message["is_observed"] else "latent"
+        if isinstance(message["fn"], numpyro.distributions.Unit):
+            return None
+    else:
+        return None
+    value = message["value"]
+    frames = message["cond_indep_stack"]
+    name = message["name"]
+    fn = message["fn"] if kind != "deterministic" else None
+    event_dim = fn.event_dim if fn is not None else 0
+    shape = tuple(np.shape(value))
+    return Site(
+        name=name,
+        kind=kind,
+        shape=shape,
+        axes=_axes(name, shape, frames, event_dim, notes),
+        plates=tuple(frame.name for frame in frames),
+        is_complex=bool(np.issubdtype(jax.numpy.result_type(value), np.complexfloating)),
+        support=fn.support if fn is not None else None,
+        distribution=type(_inner(fn)).__name__ if fn is not None else None,
+        argument=_argument(name, value, data) if kind == "observed" else None,
+    )
+
+
+def _inner(fn: Any) -> Any:
+    while hasattr(fn, "base_dist"):
+        fn = fn.base_dist
+    return fn
+
+
+def _axes(
+    name: str, shape: tuple[int, ...], frames: Sequence[Any], event_dim: int, notes: Metadata
+) -> tuple[str, ...]:
+    declared = notes.axes.get(name)
+    if declared is not None:
+        if len(declared) != len(shape):
+            raise InputError(
+                f"axes of site {name!r}",
+                f"{len(shape)} names for shape {shape}",
+                f"{len(declared)}: {', '.join(declared)}",
+                "Name every dimension, first to last.",
+            )
+        return declared
+    axes = [f"{name}_dim_{i}" for i in range(len(shape))]
+    for frame in frames:
+        position = len(shape) - event_dim + frame.dim
+        if 0 <= position < len(shape) and shape[position] == frame.size:
+            axes[position] = frame.name
+    return tuple(axes)
+
+
+def _argument(name: str, value: Any, data: Data) -> str | None:
+    if name in data:
+        return name
+    for argument, entry in data.items():
+        if entry is value:
+            return argument
+    return None

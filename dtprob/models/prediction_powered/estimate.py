@@ -1,0 +1,186 @@
+"""Estimates and their intervals under each scheme."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from scipy import stats
+
+from dtprob.errors import InputError
+from dtprob.models.prediction_powered.covariance import inverse_hessian, spread
+from dtprob.models.prediction_powered.losses import AbstractLoss, named_loss
+from dtprob.models.prediction_powered.moments import Evaluation, evaluate
+from dtprob.models.prediction_powered.quantile import Quantile, estimate_quantile
+from dtprob.models.prediction_powered.result import Estimate
+from dtprob.models.prediction_powered.sample import Sample
+from dtprob.models.prediction_powered.schemes import Mix, Scheme, named_scheme
+from dtprob.models.prediction_powered.solve import minimise
+from dtprob.models.prediction_powered.tuning import CAREFUL, By, Lambda, Practice, fixed, tune
+
+NO_UNLABELLED: Final = "There are no unlabelled samples with predictions, so this is plain ERM."
+BIASED: Final = "The interval does not cover the bias of the predictor."
+
+
+def estimate(
+    loss: str | AbstractLoss | Quantile,
+    sample: Sample,
+    scheme: str = "tuned_cppi",
+    *,
+    lam: float | None = None,
+    by: By = "overall",
+    level: float = 0.9,
+    practice: Practice = CAREFUL,
+) -> Estimate:
+    """The minimiser of a scheme's corrected loss, with an interval for each parameter.
+
+    Args:
+        loss: "mean", "ols", "logistic", "poisson", a `Quantile`, or a loss of the user's own.
+        sample: the data; for "ppi" and "tuned_ppi" its predictions come from one predictor that saw none of
+            the labels, for "cppi" and "tuned_cppi" from K predictors trained without one fold each.
+        scheme: "erm", "ss", "ppi", "tuned_ppi", "cppi" or "tuned_cppi".
+        lam: weight of the correction, from 0 to 1, instead of the scheme's.
+        by: with a tuned scheme, one lambda overall, per parameter or per context.
+        level: of the intervals.
+        practice: conventions for finite samples.
+
+    Raises:
+        InputError: an unknown name, a level or lambda out of range, data on which the loss has no minimiser.
+    """
+    chosen = _checked(named_scheme(scheme), lam, level)
+    notes: tuple[str, ...] = ()
+    if not sample.has_predictions and chosen.name != "erm":
+        chosen, notes = named_scheme("erm"), (NO_UNLABELLED,)
+    if isinstance(loss, Quantile):
+        result = estimate_quantile(loss, sample, chosen, level=level, practice=practice)
+    else:
+        _check_contexts(by, sample, practice)
+        result = _estimate(_problem(named_loss(loss), sample, chosen, practice), by, level)
+    return replace(result, notes=(*notes, *result.notes))
+
+
+def _checked(scheme: Scheme, lam: float | None, level: float) -> Scheme:
+    if not 0 < level < 1:
+        raise InputError("level", "a number between 0 and 1", repr(level), "Give 0.9 for 90% intervals")
+    if lam is None:
+        return scheme
+    if scheme.pooled:
+        raise InputError("lam", "nothing with scheme ss", repr(lam), "Use ppi or cppi")
+    if not 0 <= lam <= 1:
+        raise InputError("lam", "a number from 0 to 1", repr(lam), "Leave it out to tune it")
+    return replace(scheme, lam=lam)
+
+
+def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
+    practice, lam = problem.practice, fixed(problem.first_lambda, problem.start)
+    theta = problem.solve(lam, problem.theta, problem.start)
+    evaluation = problem.at(theta)
+    for _ in range(problem.rounds):
+        lam = tune(evaluation, problem.inverse(evaluation, lam), by, practice)
+        theta = problem.solve(lam, theta, evaluation)
+        evaluation = problem.at(theta)
+    inverse = problem.inverse(evaluation, lam)
+    found = spread(evaluation, problem.mixes(lam.value), inverse, practice)
+    alone = spread(evaluation, problem.mixes(jnp.zeros_like(lam.value)), inverse, practice)
+    covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
+    chance = (1 + level) / 2
+    quantile = stats.norm.ppf(chance) if practice.reference == "normal" else stats.t.ppf(chance, degrees)
+    half = quantile * np.sqrt(np.diagonal(covariance))
+    point, sample = np.asarray(theta), problem.sample
+    return Estimate(
+        theta=point,
+        covariance=covariance,
+        degrees=degrees,
+        low=point - half,
+        high=point + half,
+        level=level,
+        lam=jax.tree.map(np.asarray, lam),
+        labels_only_variance=np.diagonal(np.asarray(alone.covariance)),
+        scheme=problem.scheme,
+        n=sample.n,
+        n_unlabelled=sample.n_unlabelled if sample.has_predictions else 0,
+        notes=(BIASED,) if problem.scheme.pooled else (),
+    )
+
+
+def _check_contexts(by: By, sample: Sample, practice: Practice) -> None:
+    if by == "context" and practice.form == "estimates":
+        remedy = "Use form loss, or tune overall"
+        raise InputError("practice", "form loss, to tune by context", "form estimates", remedy)
+    if by == "context" and sample.has_predictions and sample.context_unlabelled is None:
+        remedy = "Give context and context_unlabelled"
+        raise InputError("sample", "contexts of all samples, to tune by context", "none", remedy)
+
+
+def _problem(loss: AbstractLoss, sample: Sample, scheme: Scheme, practice: Practice) -> _Problem:
+    theta = loss.start(jnp.asarray(sample.features), jnp.asarray(sample.y))
+    return _Problem(loss, sample, scheme, practice, theta, evaluate(loss, sample, theta))
+
+
+@final
+@dataclass(frozen=True)
+class _Problem:
+    """A loss, a scheme and data, with the data's evaluation at a starting point."""
+
+    loss: AbstractLoss
+    sample: Sample
+    scheme: Scheme
+    practice: Practice
+    theta: Float[Array, " parameter"]
+    start: Evaluation
+
+    @property
+    def first_lambda(self) -> float:
+        """The scheme's lambda, or that of the pilot."""
+        return self.practice.pilot if self.scheme.lam is None else self.scheme.lam
+
+    @property
+    def rounds(self) -> int:
+        """How often lambda is tuned."""
+        if not self.scheme.is_tuned:
+            return 0
+        return 1 if self.is_translation else self.practice.rounds
+
+    @property
+    def is_translation(self) -> bool:
+        """Whether theta only shifts the gradients, so that one evaluation tells all."""
+        weighted = self.sample.weight is not None or self.sample.weight_unlabelled is not None
+        return self.loss.traits.translation and not weighted
+
+    def at(self, theta: Float[Array, " parameter"]) -> Evaluation:
+        return self.start if self.is_translation else evaluate(self.loss, self.sample, theta)
+
+    def mixes(self, lam: Float[Array, "*parameter context"]) -> Mix:
+        return self.scheme.mix(self.start.n, self.start.n_unlabelled, lam)
+
+    def inverse(self, evaluation: Evaluation, lam: Lambda) -> Float[Array, "parameter parameter"]:
+        return inverse_hessian(self.loss, evaluation, self.mixes(jnp.mean(lam.value, axis=0)))
+
+    def solve(
+        self, lam: Lambda, theta: Float[Array, " parameter"], evaluation: Evaluation
+    ) -> Float[Array, " parameter"]:
+        """Each parameter from the corrected loss with its own lambda, sought from `theta`."""
+        if self.is_translation:
+            theta = self.theta
+        rows, inverse = np.unique(np.asarray(lam.value), axis=0, return_inverse=True)
+        found = [self._minimise(jnp.asarray(row), theta, evaluation) for row in rows]
+        return jnp.stack(found)[inverse.reshape(-1), jnp.arange(len(self.theta))]
+
+    def _minimise(
+        self, lam: Float[Array, " context"], theta: Float[Array, " parameter"], evaluation: Evaluation
+    ) -> Float[Array, " parameter"]:
+        def least(mix: Mix) -> Array:
+            return minimise(self.loss, self.sample, mix, evaluation, theta)
+
+        mix = self.mixes(lam)
+        if self.practice.form == "loss" or self.scheme.pooled:
+            return least(mix)
+        zero, one = jnp.zeros_like(mix.true), jnp.ones_like(lam)
+        own = least(Mix(mix.true, 0 * one, 0 * one))
+        if not bool(jnp.any(lam > 0)):
+            return own
+        return own + lam[0] * (least(Mix(zero, one, 0 * one)) - least(Mix(zero, 0 * one, -one)))

@@ -1,0 +1,122 @@
+"""Predictors of labels: what scikit-learn calls a regressor or classifier, and two in closed form.
+
+A `JaxPredictor` is trained by a pure function of a weight per sample, so that the predictors of all folds are
+one `vmap` over the masks that leave out a fold.
+"""
+
+import abc
+from typing import Any, Protocol, final, runtime_checkable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+
+@runtime_checkable
+class Trainable(Protocol):
+    """Anything with the two methods of a scikit-learn estimator."""
+
+    def fit(self, X: Any, y: Any, /) -> Any:
+        """Learn from features (n, feature) and labels."""
+        ...
+
+    def predict(self, X: Any, /) -> Any:
+        """Labels of features (m, feature)."""
+        ...
+
+
+class JaxPredictor(eqx.Module):
+    """A predictor that is trained and asked by pure functions."""
+
+    @abc.abstractmethod
+    def train(
+        self,
+        key: PRNGKeyArray,
+        x: Float[Array, "sample feature"],
+        y: Float[Array, "sample ..."],
+        weight: Float[Array, " sample"],
+    ) -> Any:
+        """What is learned, a pytree; samples of weight 0 must not matter."""
+
+    @abc.abstractmethod
+    def predict(self, learned: Any, x: Float[Array, "sample feature"]) -> Float[Array, "sample ..."]:
+        """Predicted labels."""
+
+
+@final
+class Ridge(JaxPredictor):
+    """Linear regression with an intercept and a penalty on the squared coefficients of standardised features.
+
+    Attributes:
+        penalty: weight of the penalty, in samples.
+    """
+
+    penalty: float = 1e-3
+
+    def train(
+        self,
+        key: PRNGKeyArray,
+        x: Float[Array, "sample feature"],
+        y: Float[Array, "sample ..."],
+        weight: Float[Array, " sample"],
+    ) -> Any:
+        """Location and scale of the features, intercept and coefficients."""
+        del key
+        location, scale = standard(x, weight)
+        design = (x - location) / scale
+        total = jnp.sum(weight)
+        mean = jnp.tensordot(weight, y, 1) / total
+        gram = (design * weight[:, None]).T @ design + self.penalty * jnp.eye(x.shape[1], dtype=x.dtype)
+        moment = jnp.tensordot((design * weight[:, None]).T, y - mean, 1)
+        return location, scale, mean, jnp.linalg.solve(gram, moment)
+
+    def predict(self, learned: Any, x: Float[Array, "sample feature"]) -> Float[Array, "sample ..."]:
+        """Intercept plus coefficients times standardised features."""
+        location, scale, mean, coefficient = learned
+        return mean + jnp.tensordot((x - location) / scale, coefficient, 1)
+
+
+@final
+class Neighbours(JaxPredictor):
+    """The inverse-distance weighted mean label of the nearest samples, features in one common unit.
+
+    Attributes:
+        count: how many neighbours.
+        power: of the distance in the weights.
+    """
+
+    count: int = eqx.field(static=True, default=3)
+    power: float = 1.0
+
+    def train(
+        self,
+        key: PRNGKeyArray,
+        x: Float[Array, "sample feature"],
+        y: Float[Array, "sample ..."],
+        weight: Float[Array, " sample"],
+    ) -> Any:
+        """The samples themselves."""
+        del key
+        return x, y, weight
+
+    def predict(self, learned: Any, x: Float[Array, "sample feature"]) -> Float[Array, "sample ..."]:
+        """The weighted mean; the label itself at the place of a sample."""
+        places, labels, weight = learned
+        square = jnp.sum(x**2, axis=1)[:, None] + jnp.sum(places**2, axis=1) - 2 * x @ places.T
+        square = jnp.where(weight > 0, jnp.maximum(square, 0.0), jnp.inf)
+        negative, index = jax.lax.top_k(-square, min(self.count, len(places)))
+        floor = 1e-12 * (1 + jnp.max(places**2))
+        closeness = jnp.where(jnp.isfinite(negative), (floor - negative) ** (-self.power / 2), 0.0)
+        share = closeness / jnp.sum(closeness, axis=1, keepdims=True)
+        return jnp.sum(share.reshape(*share.shape, *[1] * (labels.ndim - 1)) * labels[index], axis=1)
+
+
+def standard(
+    x: Float[Array, "sample feature"], weight: Float[Array, " sample"]
+) -> tuple[Float[Array, " feature"], Float[Array, " feature"]]:
+    """Weighted mean and standard deviation of each feature, 1 where a feature does not vary."""
+    total = jnp.sum(weight)
+    location = weight @ x / total
+    scale = jnp.sqrt(weight @ (x - location) ** 2 / total)
+    return location, jnp.where(scale > 0, scale, 1.0)

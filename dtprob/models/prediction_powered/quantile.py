@@ -1,0 +1,218 @@
+"""Quantiles: their loss has no second derivative, but their estimate and interval need only sorting.
+
+The corrected distribution function is F = F_Y + lambda (F~_f - F_f); the estimate is the value at which F is
+nearest the level, and the interval holds all values that a test at that level does not reject.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+from scipy import stats
+
+from dtprob.errors import InputError
+from dtprob.models.prediction_powered.moments import Evaluation, Group
+from dtprob.models.prediction_powered.result import Estimate
+from dtprob.models.prediction_powered.sample import Sample
+from dtprob.models.prediction_powered.schemes import Scheme
+from dtprob.models.prediction_powered.tuning import Lambda, Practice, fixed, tune
+
+
+@final
+@dataclass(frozen=True)
+class Quantile:
+    """The quantile of the label.
+
+    Attributes:
+        level: which, between 0 and 1.
+
+    Raises:
+        InputError: a level out of range.
+    """
+
+    level: float
+
+    def __post_init__(self) -> None:
+        """Check the level."""
+        if not 0 < self.level < 1:
+            remedy = "Give 0.5 for the median"
+            raise InputError("quantile", "a level between 0 and 1", repr(self.level), remedy)
+
+
+class Steps(NamedTuple):
+    """The data as steps of the corrected distribution functions, over all distinct values.
+
+    Attributes:
+        value: the distinct values, ascending.
+        true: distribution function of the labels there.
+        predicted: of the predictions of labelled samples.
+        both: of the greater of the two.
+        unlabelled: of the predictions of unlabelled samples, all predictors together.
+        square: mean square over unlabelled samples of the share of predictors at or below the value.
+        square_true, square_predicted: like true and predicted, with squared weights.
+    """
+
+    value: Float[np.ndarray, " value"]
+    true: Float[np.ndarray, " value"]
+    predicted: Float[np.ndarray, " value"]
+    both: Float[np.ndarray, " value"]
+    unlabelled: Float[np.ndarray, " value"]
+    square: Float[np.ndarray, " value"]
+    square_true: Float[np.ndarray, " value"]
+    square_predicted: Float[np.ndarray, " value"]
+
+    def function(self, true: float, unlabelled: float, predicted: float) -> Float[np.ndarray, " value"]:
+        """The mixed distribution function."""
+        return true * self.true + unlabelled * self.unlabelled - predicted * self.predicted
+
+    def at(self, theta: float) -> Steps:
+        """The functions at one value."""
+        index = np.searchsorted(self.value, theta, side="right") - 1
+        return Steps(*(np.atleast_1d(part[index]) for part in self))
+
+
+def estimate_quantile(
+    loss: Quantile, sample: Sample, scheme: Scheme, *, level: float, practice: Practice
+) -> Estimate:
+    """The quantile under a scheme; see `estimate`.
+
+    The predictions of unlabelled samples are held in memory, features are not read.
+
+    Raises:
+        InputError: labels with more than one entry.
+    """
+    if sample.y.ndim != 1:
+        got = f"shape {sample.y.shape}"
+        raise InputError("y", "labels of one number, for a quantile", got, "Take one entry at a time")
+    problem = quantile_problem(loss, sample, scheme)
+    start = practice.pilot if scheme.lam is None else scheme.lam
+    lam = fixed(start, problem.evaluation(0.0))
+    theta = problem.nearest(lam)
+    for _ in range(practice.rounds if scheme.is_tuned else 0):
+        lam = tune(problem.evaluation(theta), jnp.ones((1, 1)), "overall", practice)
+        theta = problem.nearest(lam)
+    return problem.result(theta, lam, level)
+
+
+def _steps(sample: Sample) -> Steps:
+    weight, y = sample.labelled_weight, sample.y
+    prediction = y if sample.prediction is None else sample.prediction
+    chunks = [
+        (np.asarray(chunk.prediction), np.asarray(chunk.weight))
+        for chunk in (sample.chunks() if sample.has_predictions else ())
+    ]
+    unlabelled = np.concatenate([p for p, _ in chunks]) if chunks else np.zeros((0, 1))
+    weights = np.concatenate([w for _, w in chunks]) if chunks else np.zeros(0)
+    unlabelled, weights = unlabelled[weights > 0], weights[weights > 0]
+    folds, count = unlabelled.shape[1], max(sample.n_unlabelled, 1)
+    ordered = np.sort(unlabelled, axis=1)
+    rank = (2 * np.arange(folds) + 1) / folds**2
+    value = np.unique(np.concatenate([y, prediction, unlabelled.ravel()]))
+
+    def function(points: np.ndarray, mass: np.ndarray) -> np.ndarray:
+        place = np.searchsorted(value, points.ravel())
+        return np.cumsum(np.bincount(place, mass.ravel(), minlength=len(value)))
+
+    n = sample.n
+    return Steps(
+        value=value,
+        true=function(y, weight / n),
+        predicted=function(prediction, weight / n),
+        both=function(np.maximum(y, prediction), weight**2 / n),
+        unlabelled=function(ordered, np.repeat(weights[:, None], folds, 1) / (folds * count)),
+        square=function(ordered, weights[:, None] ** 2 * rank / count),
+        square_true=function(y, weight**2 / n),
+        square_predicted=function(prediction, weight**2 / n),
+    )
+
+
+def quantile_problem(loss: Quantile, sample: Sample, scheme: Scheme) -> QuantileProblem:
+    """A quantile's data, sorted."""
+    return QuantileProblem(loss, sample, scheme, _steps(sample))
+
+
+@final
+@dataclass(frozen=True)
+class QuantileProblem:
+    """A quantile, a scheme and data, with the data's distribution functions."""
+
+    loss: Quantile
+    sample: Sample
+    scheme: Scheme
+    steps: Steps
+
+    def evaluation(self, theta: float) -> Evaluation:
+        """The gradients of the check loss at theta, in the form that tuning takes."""
+        sample, level, there = self.sample, self.loss.level, self.steps.at(theta)
+        prediction = sample.y if sample.prediction is None else sample.prediction
+
+        def gradient(values: np.ndarray) -> jax.Array:
+            return jnp.asarray(sample.labelled_weight * ((values <= theta) - level))[:, None]
+
+        mean = there.unlabelled[0] - level
+        second = there.square[0] - 2 * level * there.unlabelled[0] + level**2
+        one = jnp.ones((1, 1, 1))
+        nothing = Group(jnp.zeros(1), jnp.zeros((1, 1)), one, one)
+        return Evaluation(
+            labelled=nothing,
+            predicted=nothing,
+            unlabelled=Group(jnp.zeros(1), jnp.full((1, 1), mean), one, jnp.full((1, 1, 1), second)),
+            gradient=gradient(sample.y),
+            predicted_gradient=gradient(prediction),
+            context=jnp.zeros(sample.n, int),
+            n=jnp.asarray(float(sample.n)),
+            n_unlabelled=jnp.asarray(float(max(sample.n_unlabelled, 1))),
+        )
+
+    def mix(self, lam: Lambda) -> tuple[float, float, float]:
+        """The weights of the three distribution functions."""
+        n, count = jnp.asarray(float(self.sample.n)), jnp.asarray(float(self.sample.n_unlabelled))
+        mix = self.scheme.mix(n, count, lam.value[0])
+        return float(mix.true), float(mix.unlabelled[0]), float(mix.predicted[0])
+
+    def nearest(self, lam: Lambda) -> float:
+        """The value at which the mixed distribution function is nearest the level."""
+        distance = np.abs(self.steps.function(*self.mix(lam)) - self.loss.level)
+        return float(self.steps.value[np.argmin(distance)])
+
+    def variance(self, steps: Steps, mix: tuple[float, float, float]) -> Float[np.ndarray, " value"]:
+        """Variance of the mixed distribution function at each value."""
+        true, unlabelled, predicted = mix
+        mean = true * steps.true - predicted * steps.predicted
+        square = true**2 * steps.square_true + predicted**2 * steps.square_predicted
+        labelled = np.maximum(square - 2 * true * predicted * steps.both - mean**2, 0.0)
+        rest = unlabelled**2 * np.maximum(steps.square - steps.unlabelled**2, 0.0)
+        return labelled / self.sample.n + rest / max(self.sample.n_unlabelled, 1)
+
+    def unlabelled_variance(self, theta: float) -> float:
+        """Variance of the unlabelled distribution function at a value."""
+        there = self.steps.at(theta)
+        return float(self.variance(there, (0.0, 1.0, 0.0))[0])
+
+    def result(self, theta: float, lam: Lambda, level: float) -> Estimate:
+        """The estimate with the interval of all values that are not rejected."""
+        mix, z = self.mix(lam), stats.norm.ppf((1 + level) / 2)
+        deviation = np.abs(self.steps.function(*mix) - self.loss.level)
+        inside = self.steps.value[deviation < z * np.sqrt(self.variance(self.steps, mix))]
+        low, high = (inside[0], inside[-1]) if len(inside) else (theta, theta)
+        variance = ((high - low) / (2 * z)) ** 2
+        there = self.steps.at(theta)
+        own, alone = self.variance(there, mix)[0], self.variance(there, (1.0, 0.0, 0.0))[0]
+        return Estimate(
+            theta=np.array([theta]),
+            covariance=np.array([[variance]]),
+            degrees=np.array([np.inf]),
+            low=np.array([low]),
+            high=np.array([high]),
+            level=level,
+            lam=jax.tree.map(np.asarray, lam),
+            labels_only_variance=np.array([variance * alone / own if own > 0 else 0.0]),
+            scheme=self.scheme,
+            n=self.sample.n,
+            n_unlabelled=self.sample.n_unlabelled if self.sample.has_predictions else 0,
+        )

@@ -1,0 +1,258 @@
+"""What inference starts from: a few labelled samples, many unlabelled ones, and predictions for both."""
+
+from collections.abc import Callable, Generator
+from dataclasses import dataclass, field
+from typing import Any, Final, NamedTuple, final
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from dtprob.errors import InputError
+
+_CHUNK_NUMBERS: Final = 16_000_000
+"""Numbers in a chunk of unlabelled data, 128 MB in double precision."""
+
+type Predictor = Callable[[np.ndarray], np.ndarray]
+
+
+class Chunk(NamedTuple):
+    """Consecutive unlabelled samples; rows added to fill a chunk have weight 0."""
+
+    x: Float[Array, "sample feature"]
+    prediction: Float[Array, "sample fold ..."]
+    weight: Float[Array, " sample"]
+    context: Int[Array, " sample"]
+
+
+@final
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Sample:
+    """Labelled and unlabelled samples with predictions, checked when made.
+
+    The unlabelled arrays may be anything that has a shape and is cut by slices (a NumPy or JAX array, a
+    memory map, an HDF5 or Zarr array); they are read one chunk at a time, and held whole only if they fit in
+    one.
+
+    Attributes:
+        y: labels, (n,) or (n, label).
+        x: features of the labelled samples, (n, feature); None where the loss needs none (mean, quantile).
+        prediction: predicted labels of the labelled samples, with the shape of y; each by a predictor that
+            has not seen that sample's label.
+        x_unlabelled: features, (N, feature).
+        prediction_unlabelled: predicted labels, (N, *label), or (N, K, *label) by K predictors, or a function
+            of a chunk of x_unlabelled that gives them.
+        weight: of the labelled samples, not negative; scaled to mean 1.
+        weight_unlabelled: of the unlabelled samples, likewise.
+        context: for each labelled sample, which context it belongs to, 0, 1, ...; each context has a lambda
+            of its own when tuning asks for it.
+        context_unlabelled: likewise for the unlabelled samples.
+        chunk: rows of a chunk; by default about 128 MB.
+
+    Raises:
+        InputError: shapes that do not fit together, NaN or infinity among labels, features or predictions of
+            labelled samples, negative weights.
+    """
+
+    y: np.ndarray
+    x: np.ndarray | None = None
+    prediction: np.ndarray | None = None
+    x_unlabelled: Any = None
+    prediction_unlabelled: Any = None
+    weight: np.ndarray | None = None
+    weight_unlabelled: np.ndarray | None = None
+    context: np.ndarray | None = None
+    context_unlabelled: np.ndarray | None = None
+    chunk: int | None = None
+    _whole: dict[str, Chunk] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        """Check everything that can be checked without a pass over the unlabelled data."""
+        labels = np.asarray(self.y)
+        if labels.ndim not in (1, 2) or not len(labels):
+            got = f"shape {labels.shape}"
+            raise InputError("y", "labels, shape (n,) or (n, label)", got, "Give one row per labelled sample")
+        self._set("y", _finite("y", labels))
+        n = len(labels)
+        x = np.zeros((n, 0)) if self.x is None else _matrix("x", self.x, n)
+        self._set("x", _finite("x", x))
+        self._set("weight", _weights("weight", self.weight, n))
+        self._set("context", _contexts("context", self.context, n))
+        if self.prediction is not None:
+            prediction = np.asarray(self.prediction)
+            if prediction.shape != labels.shape:
+                remedy = "Give one prediction per labelled sample"
+                raise InputError("prediction", f"shape {labels.shape}", str(prediction.shape), remedy)
+            self._set("prediction", _finite("prediction", prediction))
+        self._check_unlabelled()
+
+    def _set(self, name: str, value: Any) -> None:
+        object.__setattr__(self, name, value)
+
+    def _check_unlabelled(self) -> None:
+        count = self.n_unlabelled
+        self._set("weight_unlabelled", _weights("weight_unlabelled", self.weight_unlabelled, count))
+        self._set("context_unlabelled", _contexts("context_unlabelled", self.context_unlabelled, count))
+        if count == 0:
+            return
+        if self.x_unlabelled is not None:
+            _matrix("x_unlabelled", self.x_unlabelled, count, convert=False)
+            width, expected = self.x_unlabelled.shape[1], self.features.shape[1]
+            if width != expected:
+                got = f"width {width}"
+                remedy = "Give labelled and unlabelled samples the same features, in the same order"
+                raise InputError("x_unlabelled", f"width {expected}, as x has", got, remedy)
+        elif self.features.shape[1]:
+            raise InputError("x_unlabelled", "features, as x has", "nothing", "Give x_unlabelled")
+        if self.prediction_unlabelled is None:
+            return
+        if self.prediction is None:
+            remedy = "Predict the labelled samples too, each without its own label"
+            raise InputError("prediction", "predictions of the labelled samples", "nothing", remedy)
+        if not callable(self.prediction_unlabelled):
+            _prediction_shape(self.prediction_unlabelled.shape, count, self.y.shape[1:])
+        highest = -1 if self.context_unlabelled is None else int(self.context_unlabelled.max())
+        if highest >= self.n_context:
+            got = f"context {highest}"
+            remedy = "Leave out contexts without labelled samples, or join them to others"
+            raise InputError("context_unlabelled", f"contexts below {self.n_context}", got, remedy)
+
+    @property
+    def n(self) -> int:
+        """Number of labelled samples."""
+        return len(self.y)
+
+    @property
+    def n_unlabelled(self) -> int:
+        """Number of unlabelled samples."""
+        for array in (self.x_unlabelled, self.prediction_unlabelled):
+            if array is not None and not callable(array):
+                return int(array.shape[0])
+        return 0
+
+    @property
+    def n_context(self) -> int:
+        """Number of contexts."""
+        return int(self.labelled_context.max()) + 1
+
+    @property
+    def has_predictions(self) -> bool:
+        """Whether there are unlabelled samples with predictions."""
+        return self.prediction_unlabelled is not None and self.n_unlabelled > 0
+
+    @property
+    def features(self) -> np.ndarray:
+        """Features of the labelled samples, width 0 where there are none."""
+        return np.zeros((self.n, 0)) if self.x is None else self.x
+
+    @property
+    def labelled_weight(self) -> np.ndarray:
+        """Weights of the labelled samples, mean 1."""
+        return np.ones(self.n) if self.weight is None else self.weight
+
+    @property
+    def labelled_context(self) -> np.ndarray:
+        """Contexts of the labelled samples."""
+        return np.zeros(self.n, int) if self.context is None else self.context
+
+    def chunks(self) -> Generator[Chunk]:
+        """The unlabelled samples, one chunk after another, all of one size."""
+        if "whole" in self._whole:
+            yield self._whole["whole"]
+            return
+        rows = self.rows_per_chunk
+        for start in range(0, self.n_unlabelled, rows):
+            chunk = self._read(slice(start, min(start + rows, self.n_unlabelled)), rows)
+            if rows >= self.n_unlabelled:
+                self._whole["whole"] = chunk
+            yield chunk
+
+    @property
+    def rows_per_chunk(self) -> int:
+        """Unlabelled samples read at a time."""
+        if self.chunk is not None:
+            return min(self.chunk, max(self.n_unlabelled, 1))
+        prediction = self.prediction_unlabelled
+        shape = () if prediction is None or callable(prediction) else prediction.shape[1:]
+        width = self.features.shape[1] + int(np.prod(shape)) + 2
+        return min(max(_CHUNK_NUMBERS // width, 1024), max(self.n_unlabelled, 1))
+
+    def _read(self, rows: slice, size: int) -> Chunk:
+        count = rows.stop - rows.start
+        x = np.zeros((count, 0)) if self.x_unlabelled is None else self.x_unlabelled[rows]
+        given = self.prediction_unlabelled
+        prediction: Any = given(np.asarray(x)) if callable(given) else given[rows]
+        shape = _prediction_shape(np.shape(prediction), count, self.y.shape[1:])
+        weight = np.ones(count) if self.weight_unlabelled is None else self.weight_unlabelled[rows]
+        context = np.zeros(count, int) if self.context_unlabelled is None else self.context_unlabelled[rows]
+        short = size - count
+
+        def filled(array: Any, shape: tuple[int, ...]) -> Array:
+            whole = jnp.asarray(array).reshape(shape)
+            return jnp.pad(whole, [(0, short), *[(0, 0)] * (len(shape) - 1)]) if short else whole
+
+        return Chunk(
+            filled(x, np.shape(x)),
+            filled(prediction, shape),
+            filled(weight, (count,)),
+            filled(context, (count,)),
+        )
+
+
+def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]) -> tuple[int, ...]:
+    """The shape (sample, fold, *label) of given predictions."""
+    if shape == (count, *label):
+        return count, 1, *label
+    if len(shape) == 2 + len(label) and shape[0] == count and shape[2:] == label:
+        return shape
+    expected = f"shape {(count, *label)}, or a further axis of predictors after the first"
+    raise InputError("prediction_unlabelled", expected, str(shape), "Give a prediction per unlabelled sample")
+
+
+def _finite(name: str, array: np.ndarray) -> np.ndarray:
+    if array.dtype.kind not in "fiub":
+        raise InputError(name, "real numbers", f"values of type {array.dtype}", f"Give {name} as numbers")
+    array = array.astype(np.result_type(array.dtype, np.float32), copy=False)
+    bad = ~np.isfinite(array)
+    if bad.any():
+        place = tuple(int(i) for i in np.argwhere(bad)[0])
+        shown = place[0] if len(place) == 1 else place
+        got = f"{array[place]} at index {shown}"
+        remedy = "Move samples without a label to the unlabelled ones" if name == "y" else "Remove the sample"
+        raise InputError(name, "finite numbers", got, remedy)
+    return array
+
+
+def _matrix(name: str, value: Any, count: int, *, convert: bool = True) -> Any:
+    array = np.asarray(value) if convert else value
+    if len(array.shape) != 2 or array.shape[0] != count:
+        got = f"shape {tuple(array.shape)}"
+        raise InputError(name, f"shape ({count}, feature)", got, "Give one row per sample")
+    return array
+
+
+def _weights(name: str, value: Any, count: int) -> np.ndarray | None:
+    if value is None:
+        return None
+    weight = np.asarray(value, float)
+    if weight.shape != (count,):
+        raise InputError(name, f"shape ({count},)", str(weight.shape), "Give one weight per sample")
+    bad = ~(weight >= 0) | ~np.isfinite(weight)
+    if bad.any():
+        first = int(np.argmax(bad))
+        got = f"{weight[first]:g} at index {first}"
+        raise InputError(name, "weights from 0 up", got, "Give the weight of a sample, not its difference")
+    if not weight.sum() > 0:
+        raise InputError(name, "a weight above 0", "zeros only", "Give the samples that count a weight")
+    return weight / weight.mean()
+
+
+def _contexts(name: str, value: Any, count: int) -> np.ndarray | None:
+    if value is None:
+        return None
+    context = np.asarray(value)
+    if context.shape != (count,) or context.dtype.kind not in "iu" or (count and context.min() < 0):
+        got = f"shape {context.shape}, type {context.dtype}"
+        remedy = "Number the contexts from 0"
+        raise InputError(name, f"shape ({count},), whole numbers from 0", got, remedy)
+    return context

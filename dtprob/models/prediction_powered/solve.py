@@ -1,0 +1,120 @@
+"""The minimiser of a corrected loss, by Newton's method over one or more passes through the data."""
+
+from typing import Final, NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dtprob.errors import InputError
+from dtprob.models.prediction_powered.losses import AbstractLoss
+from dtprob.models.prediction_powered.moments import Evaluation, evaluate
+from dtprob.models.prediction_powered.sample import Sample
+from dtprob.models.prediction_powered.schemes import Mix
+
+_MAX_STEPS: Final = 60
+_MAX_HALVINGS: Final = 30
+
+
+class Newton(NamedTuple):
+    """A Newton step of the corrected loss.
+
+    Attributes:
+        value: the corrected loss here.
+        step: what to subtract from theta.
+        decrement: gradient times step: twice what the step is expected to gain.
+        condition: smallest curvature, in units that make the curvature along each parameter 1.
+    """
+
+    value: Float[Array, ""]
+    step: Float[Array, " parameter"]
+    decrement: Float[Array, ""]
+    condition: Float[Array, ""]
+
+
+@eqx.filter_jit
+def newton(evaluation: Evaluation, mix: Mix) -> Newton:
+    """The Newton step at an evaluation; directions of negative curvature are followed downhill."""
+    labelled, unlabelled, predicted = evaluation.labelled, evaluation.unlabelled, evaluation.predicted
+
+    def total(part: str) -> Array:
+        corrected = jnp.tensordot(mix.unlabelled, getattr(unlabelled, part), 1)
+        return (
+            mix.true * getattr(labelled, part)[0]
+            + corrected
+            - jnp.tensordot(mix.predicted, getattr(predicted, part), 1)
+        )
+
+    gradient, hessian = total("gradient"), total("hessian")
+    diagonal = jnp.abs(jnp.diagonal(hessian))
+    scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(diagonal), 1.0)
+    curvature, vectors = jnp.linalg.eigh(scale[:, None] * hessian * scale)
+    size = jnp.abs(curvature)
+    floor = jnp.finfo(size.dtype).eps * len(size)
+    step = scale * (vectors @ ((vectors.T @ (scale * gradient)) / jnp.maximum(size, floor)))
+    return Newton(total("value"), step, gradient @ step, jnp.min(size))
+
+
+def minimise(
+    loss: AbstractLoss, sample: Sample, mix: Mix, start: Evaluation, theta: Float[Array, " parameter"]
+) -> Float[Array, " parameter"]:
+    """The minimiser of the corrected loss.
+
+    Args:
+        loss: the loss.
+        sample: the data.
+        mix: the weights of its three terms.
+        start: `evaluate(loss, sample, theta)`.
+        theta: where to start.
+
+    Raises:
+        InputError: the loss has no single minimiser (dependent features), or none at a finite place
+            (separable labels).
+    """
+    tolerance = float(jnp.finfo(theta.dtype).eps)
+    move = newton(start, mix)
+    _check_condition(move, tolerance, len(theta))
+    for _ in range(_MAX_STEPS):
+        if loss.traits.quadratic or float(move.decrement) <= tolerance:
+            return theta - move.step
+        theta, move = _descend(loss, sample, mix, theta, move)
+    remedy = (
+        "Drop features that tell the labels apart perfectly, add labels, or use a scheme with predictions"
+    )
+    raise InputError("corrected loss", f"a minimum within {_MAX_STEPS} steps", "none", remedy)
+
+
+def _descend(
+    loss: AbstractLoss, sample: Sample, mix: Mix, theta: Float[Array, " parameter"], move: Newton
+) -> tuple[Array, Newton]:
+    """Take the step, halved until the loss falls (or does not rise beyond rounding)."""
+    slack = 10 * float(jnp.finfo(theta.dtype).eps) * (1 + abs(float(move.value)))
+    length = 1.0
+    for _ in range(_MAX_HALVINGS):
+        candidate = theta - length * move.step
+        evaluation = _evaluate_quietly(loss, sample, candidate)
+        if evaluation is not None:
+            following = newton(evaluation, mix)
+            if float(following.value) <= float(move.value) - 1e-4 * length * float(move.decrement) + slack:
+                return candidate, following
+        length /= 2
+    remedy = "Check that the loss is differentiable, and its scale"
+    raise InputError("corrected loss", "a value that falls along its gradient", "none", remedy)
+
+
+def _evaluate_quietly(
+    loss: AbstractLoss, sample: Sample, theta: Float[Array, " parameter"]
+) -> Evaluation | None:
+    """None where a step led so far that the loss overflows."""
+    try:
+        evaluation = evaluate(loss, sample, theta)
+    except InputError:
+        return None
+    return evaluation if bool(jnp.isfinite(evaluation.labelled.value[0])) else None
+
+
+def _check_condition(move: Newton, tolerance: float, dimension: int) -> None:
+    if float(move.condition) <= 10 * dimension * tolerance:
+        remedy = "Drop features that are constant or sums of others, or add samples"
+        got = "a direction without curvature"
+        raise InputError("features", "independent columns, fewer than samples", got, remedy)

@@ -1,0 +1,202 @@
+"""Lambda, the weight of the correction: in closed form, with its standard error, guarded against noise.
+
+The error of the estimate is -H^-1 [mean g + lambda (mean f~ - mean f)] to first order, where g and f are the
+gradients of labelled samples at labels and predictions and f~ those of unlabelled samples. Its mean square is
+quadratic in lambda, whose minimiser is a ratio of covariances (PPI++, section 6; for cross-prediction,
+arXiv 2405.15415). One lambda may serve all parameters or each its own, and all contexts or each its own.
+"""
+
+from dataclasses import dataclass
+from typing import Final, Literal, NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dtprob.errors import InputError
+from dtprob.models.prediction_powered.moments import Evaluation
+
+type By = Literal["overall", "parameter", "context"]
+
+_SWEEPS: Final = 200
+
+
+@final
+@dataclass(frozen=True, kw_only=True)
+class Practice:
+    """Conventions on which results depend in finite samples.
+
+    Attributes:
+        pilot: lambda of the estimate at which the first lambda is computed.
+        rounds: how often lambda is computed, each time at the latest estimate.
+        guard: pull lambda towards 0, or towards the value for a calibrated predictor, whichever is nearer, by
+            its squared standard error over its distance from there. An estimated lambda costs up to 1/(2n) of
+            the mean square error where the predictor is useless; the guard takes two thirds of that away.
+        pooled_spread: estimate the spread of f and f~ from both together, as if they had one distribution;
+            otherwise each from its own samples.
+        lost: degrees of freedom that the labelled samples lose; None counts the parameters.
+        form: "loss" minimises the corrected loss; "estimates" corrects the minimiser instead: labels' own
+            plus lambda times (that of unlabelled predictions minus that of labelled ones), as PPBoot does.
+        reference: "t" compares with Student's t with Welch's degrees of freedom, "normal" with the normal.
+    """
+
+    pilot: float = 0.5
+    rounds: int = 2
+    guard: bool = True
+    pooled_spread: bool = False
+    lost: int | None = None
+    form: Literal["loss", "estimates"] = "loss"
+    reference: Literal["normal", "t"] = "t"
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot work."""
+        if self.rounds < 1 or not 0 <= self.pilot <= 1:
+            got = f"rounds {self.rounds}, pilot {self.pilot}"
+            raise InputError("practice", "rounds from 1, a pilot from 0 to 1", got, "Correct them")
+
+
+CAREFUL: Final = Practice()
+"""dtprob's own: right also for fewer than a hundred labels."""
+
+PUBLISHED: Final = Practice(pilot=1.0, rounds=1, guard=False, pooled_spread=True, lost=1, reference="normal")
+"""The formulas of the PPI++ paper as its authors' package computes them, right for many labels."""
+
+
+class Lambda(NamedTuple):
+    """Lambda per parameter and context.
+
+    Attributes:
+        value: what is used, in [0, 1].
+        raw: the closed form before guard and clip.
+        standard_error: of the closed form.
+    """
+
+    value: Float[Array, "parameter context"]
+    raw: Float[Array, "parameter context"]
+    standard_error: Float[Array, "parameter context"]
+
+
+def fixed(lam: float, evaluation: Evaluation) -> Lambda:
+    """A lambda that was given."""
+    shape = evaluation.gradient.shape[1], evaluation.unlabelled.value.shape[0]
+    return Lambda(jnp.full(shape, lam), jnp.full(shape, lam), jnp.zeros(shape))
+
+
+@eqx.filter_jit
+def tune(
+    evaluation: Evaluation, inverse: Float[Array, "parameter parameter"], by: By, practice: Practice = CAREFUL
+) -> Lambda:
+    """The lambda that minimises the mean square error, estimated.
+
+    Args:
+        evaluation: the data at a pilot estimate.
+        inverse: inverse of the mean second derivative there.
+        by: one lambda overall, or one per parameter (which minimises that parameter's error), or one per
+            context (which together minimise the error of all parameters).
+        practice: conventions.
+    """
+    if by == "parameter":
+        return jax.vmap(lambda column: _tune(evaluation, column[:, None], practice))(inverse.T)
+    best = _tune(evaluation, inverse, practice)
+    d = len(inverse)
+    return Lambda(*(jnp.broadcast_to(part, (d, *part.shape)) for part in best))
+
+
+def _tune(evaluation: Evaluation, root: Float[Array, "parameter r"], practice: Practice) -> Lambda:
+    """Lambda per context for the error in the directions `root`."""
+    quadratic, linear, spread = _normal_equations(evaluation, root, practice)
+    diagonal = jnp.diagonal(quadratic)
+    usable = diagonal > 0
+    safe = quadratic + jnp.diag(jnp.where(usable, 0.0, 1.0))
+    raw = jnp.where(usable, jnp.linalg.solve(safe, linear), 0.0)
+    standard_error = jnp.where(usable, _standard_error(evaluation, root, safe, raw), 0.0)
+    value = _in_box(safe, linear) if len(linear) > 1 else raw
+    if practice.guard:
+        calibrated = jnp.where(usable, spread / jnp.diagonal(safe), 0.0)
+        value = _guarded(value, standard_error, calibrated)
+    return Lambda(jnp.clip(value, 0.0, 1.0), raw, standard_error)
+
+
+def _normal_equations(
+    evaluation: Evaluation, root: Float[Array, "parameter r"], practice: Practice
+) -> tuple[Array, Array, Array]:
+    """(A, b, diagonal of A without its unlabelled part) of the error lambda^T A lambda - 2 b^T lambda."""
+    g, f = projections(evaluation, root)
+    n = evaluation.n
+    linear = jnp.einsum("nr,ncr->c", g, f) / n
+    spread = jnp.einsum("ncr,ndr->cd", f, f) / n
+    unlabelled = unlabelled_covariance(evaluation, root)
+    ratio = n / evaluation.n_unlabelled
+    if practice.pooled_spread:
+        pooled = _pooled(evaluation, root)
+        return (1 + ratio) * pooled, linear, jnp.diagonal(pooled)
+    return spread + ratio * unlabelled, linear, jnp.diagonal(spread)
+
+
+def projections(evaluation: Evaluation, root: Float[Array, "parameter r"]) -> tuple[Array, Array]:
+    """Centred labelled gradients g (n, r) and f per context (n, context, r) along the directions `root`."""
+    n_context = evaluation.unlabelled.value.shape[0]
+    g = evaluation.gradient @ root
+    f = evaluation.predicted_gradient @ root
+    inside = evaluation.context[:, None] == jnp.arange(n_context)
+    f = inside[:, :, None] * f[:, None, :]
+    return g - jnp.mean(g, axis=0), f - jnp.mean(f, axis=0)
+
+
+def unlabelled_covariance(evaluation: Evaluation, root: Float[Array, "parameter r"]) -> Array:
+    """Covariance between contexts of the unlabelled gradients, summed over directions, (context, context)."""
+    mean = evaluation.unlabelled.gradient @ root
+    second = jnp.einsum("pr,cpq,qr->c", root, evaluation.unlabelled.second, root)
+    return jnp.diag(second) - mean @ mean.T
+
+
+def _pooled(evaluation: Evaluation, root: Float[Array, "parameter r"]) -> Array:
+    """Covariance of labelled and unlabelled gradients taken together, as of one sample."""
+    n, count = evaluation.n, evaluation.n_unlabelled
+    f = evaluation.predicted_gradient
+    n_context = evaluation.unlabelled.value.shape[0]
+    inside = (evaluation.context[:, None] == jnp.arange(n_context)).astype(f.dtype)
+    mean = (count * evaluation.unlabelled.gradient + inside.T @ f) / (n + count) @ root
+    labelled = jnp.einsum("nc,nr->c", inside, (f @ root) ** 2)
+    second = count * jnp.einsum("pr,cpq,qr->c", root, evaluation.unlabelled.second, root) + labelled
+    return (jnp.diag(second) - (n + count) * (mean @ mean.T)) / (n + count - 1)
+
+
+def _standard_error(
+    evaluation: Evaluation,
+    root: Float[Array, "parameter r"],
+    quadratic: Float[Array, "context context"],
+    raw: Float[Array, " context"],
+) -> Float[Array, " context"]:
+    """By the delta method over the labelled samples."""
+    g, f = projections(evaluation, root)
+    rest = g - jnp.einsum("ncr,c->nr", f, raw)
+    influence = jnp.einsum("nr,ncr->nc", rest, f)
+    influence = influence - jnp.mean(influence, axis=0)
+    n = evaluation.n
+    covariance = influence.T @ influence / (n * jnp.maximum(n - 2, 1.0))
+    inverse = jnp.linalg.inv(quadratic)
+    return jnp.sqrt(jnp.maximum(jnp.diagonal(inverse @ covariance @ inverse), 0.0))
+
+
+def _in_box(quadratic: Float[Array, "context context"], linear: Float[Array, " context"]) -> Array:
+    """The minimiser of lambda^T A lambda - 2 b^T lambda over [0, 1]^context, by coordinate descent."""
+    diagonal = jnp.diagonal(quadratic)
+
+    def one(index: Array, lam: Array) -> Array:
+        rest = linear[index] - quadratic[index] @ lam + diagonal[index] * lam[index]
+        return lam.at[index].set(jnp.clip(rest / diagonal[index], 0.0, 1.0))
+
+    def sweep(_: Array, lam: Array) -> Array:
+        return jax.lax.fori_loop(0, len(linear), one, lam)
+
+    return jax.lax.fori_loop(0, _SWEEPS, sweep, jnp.clip(linear / diagonal, 0.0, 1.0))
+
+
+def _guarded(value: Array, standard_error: Array, calibrated: Array) -> Array:
+    anchor = jnp.where(value < calibrated / 2, 0.0, calibrated)
+    distance = value - anchor
+    tiny = jnp.finfo(value.dtype).tiny
+    kept = jnp.maximum(0.0, 1 - standard_error**2 / jnp.maximum(distance**2, tiny))
+    return anchor + distance * jnp.where(standard_error > 0, kept, 1.0)

@@ -1,0 +1,141 @@
+"""What models of ray-traced scenes share: axes, materials, array responses, noise, the measured site."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+from jaxtyping import Array, Complex
+from numpyro.distributions import constraints, transforms
+
+from dtprob.errors import InputError
+from dtprob.models.complex_normal import ComplexNormal
+from dtprob.raytracing import field
+from dtprob.raytracing.paths import PathSet
+
+type Materials = Literal["per_material", "per_object", "shared", "known"]
+"""Which permittivities and conductivities are unknown."""
+
+CHANNEL_AXES = ("link", "snapshot", "rx_antenna", "tx_antenna", "subcarrier")
+AXES = {
+    "permittivity": ("object",),
+    "conductivity": ("object",),
+    "path_gain": ("link", "path"),
+    "path_delay": ("link", "path"),
+    "departure": ("link", "path", "direction"),
+    "arrival": ("link", "path", "direction"),
+    "path_phase": ("link", "snapshot", "path"),
+    "tx_response": ("link", "path", "tx_antenna"),
+    "rx_response": ("link", "path", "rx_antenna"),
+    "frequency_response": ("subcarrier",),
+    "noiseless_channel": CHANNEL_AXES,
+    "noise_power": CHANNEL_AXES,
+}
+
+
+def channel_shape(
+    paths: PathSet,
+    subcarrier_frequency: jax.Array,
+    rx_array: jax.Array | None,
+    tx_array: jax.Array | None,
+    snapshot_time: jax.Array | None,
+    channel: jax.Array | None,
+) -> tuple[int, int, int, int, int]:
+    """(link, snapshot, rx_antenna, tx_antenna, subcarrier), checked against the measurement's shape."""
+    expected = (
+        paths.delay.shape[0],
+        1 if snapshot_time is None else snapshot_time.shape[0],
+        1 if rx_array is None else rx_array.shape[0],
+        1 if tx_array is None else tx_array.shape[0],
+        subcarrier_frequency.shape[0],
+    )
+    if channel is None:
+        return expected
+    snapshots = channel.shape[1] if snapshot_time is None and channel.ndim == 5 else expected[1]
+    expected = (expected[0], snapshots, *expected[2:])
+    if channel.shape != expected:
+        raise InputError(
+            "channel",
+            f"shape {expected} as (link, snapshot, rx_antenna, tx_antenna, subcarrier)",
+            f"{tuple(channel.shape)}",
+            "Give one path-set link per measured link, and the arrays and subcarriers of the measurement.",
+        )
+    return expected
+
+
+def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, jax.Array]:
+    """Permittivity (relative) and conductivity (S/m) of each object, around the scene's own values."""
+    permittivity, conductivity = jnp.asarray(paths.permittivity), jnp.asarray(paths.conductivity)
+    if materials == "known":
+        return permittivity, conductivity
+    if materials == "shared":
+        size, index = 1, jnp.zeros(permittivity.shape[0], int)
+    elif materials == "per_object":
+        size, index = permittivity.shape[0], jnp.arange(permittivity.shape[0])
+    else:
+        size, index = len(paths.material_names), paths.object_material
+    first = jax.ops.segment_min(jnp.arange(index.shape[0]), index, size)
+    present = first < index.shape[0]
+    nominal_permittivity = jnp.where(present, permittivity[jnp.where(present, first, 0)], 2.0)
+    nominal_conductivity = jnp.where(present, conductivity[jnp.where(present, first, 0)], 1e-2)
+    contrast = dist.Normal(jnp.log(jnp.maximum(nominal_permittivity - 1.0, 1e-2)), 0.4)
+    above_one = [transforms.ExpTransform(), transforms.AffineTransform(1.0, 1.0, domain=constraints.positive)]
+    with numpyro.plate("material", size):
+        material_permittivity: Any = numpyro.sample(
+            "material_permittivity", dist.TransformedDistribution(contrast, above_one)
+        )
+        material_conductivity: Any = numpyro.sample(
+            "material_conductivity", dist.LogNormal(jnp.log(jnp.maximum(nominal_conductivity, 1e-4)), 1.0)
+        )
+    return material_permittivity[index], material_conductivity[index]
+
+
+def unknown_phase() -> dist.VonMises:
+    """An angle of which nothing is known: uniform to 1e-9, and it can be sampled."""
+    return dist.VonMises(0.0, 1e-9)
+
+
+def array_response(array: jax.Array | None, direction: jax.Array, frequency: float, sign: float) -> jax.Array:
+    """Phase of each element of an array on each path; one element at the centre where there is no array."""
+    if array is None:
+        array = jnp.zeros((1, 3))
+    return field.steering(array, direction, frequency, sign)
+
+
+def unknown_noise_power(noise_power: Any, paths: PathSet) -> jax.Array:
+    """Variance of the noise, broadcastable to the channel: around the given level, or a very vague one."""
+    if noise_power is None:
+        free_space = jnp.where(paths.mask, (paths.wavelength / (4 * jnp.pi * paths.length)) ** 2, 0.0)
+        reference, spread = 1e-2 * jnp.mean(jnp.sum(free_space, axis=1)), 3.5
+    else:
+        reference, spread = jnp.asarray(noise_power), 0.1
+    level: Any = numpyro.sample("noise_level", dist.LogNormal(0.0, spread))
+    reference = jnp.broadcast_to(reference, (paths.delay.shape[0],)) if jnp.ndim(reference) else reference
+    return (level * reference).reshape((-1, 1, 1, 1, 1))
+
+
+def observe(
+    noiseless: Complex[Array, "link snapshot rx_antenna tx_antenna subcarrier"],
+    noise: jax.Array,
+    shape: tuple[int, int, int, int, int],
+    channel: jax.Array | None,
+) -> None:
+    """The site `channel`: what is measured in circular Gaussian noise.
+
+    Args:
+        noiseless: the channel, broadcastable to `shape`.
+        noise: variance, broadcastable to `shape`.
+        shape: of the measurement.
+        channel: the measurement.
+    """
+    with (
+        numpyro.plate("link", shape[0], dim=-5),
+        numpyro.plate("snapshot", shape[1], dim=-4),
+        numpyro.plate("rx_antenna", shape[2], dim=-3),
+        numpyro.plate("tx_antenna", shape[3], dim=-2),
+        numpyro.plate("subcarrier", shape[4], dim=-1),
+    ):
+        numpyro.sample("channel", ComplexNormal(noiseless, noise), obs=channel)
