@@ -1,0 +1,32 @@
+"""Engines that turn a declared model and data into a posterior.
+
+Every engine is called the same way, `engine(key, model, data, options=...)`, and returns a `Posterior`
+whose draws are laid out (chain, draw, *event). `fit` takes the engine's name instead.
+"""
+
+from dtprob.inference.blackjax_nuts import BlackJAXNUTS
+from dtprob.inference.engine import AbstractEngine, RunOptions
+from dtprob.inference.fit import ENGINES, fit, resolve
+from dtprob.inference.laplace import Laplace
+from dtprob.inference.nuts import NUTS
+from dtprob.inference.point import Point
+from dtprob.inference.posterior import PointMass, Posterior, Sampler
+from dtprob.inference.summary import summary
+from dtprob.inference.von_mises_em import VonMisesEM
+
+__all__ = [
+    "ENGINES",
+    "NUTS",
+    "AbstractEngine",
+    "BlackJAXNUTS",
+    "Laplace",
+    "Point",
+    "PointMass",
+    "Posterior",
+    "RunOptions",
+    "Sampler",
+    "VonMisesEM",
+    "fit",
+    "resolve",
+    "summary",
+]

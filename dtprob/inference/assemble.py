@@ -1,0 +1,161 @@
+"""From an engine's unconstrained draws to a posterior: the same for every engine."""
+
+from __future__ import annotations
+
+import hashlib
+import importlib.metadata
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+import dtprob
+from dtprob.inference.engine import AbstractEngine, RunOptions
+from dtprob.inference.posterior import Posterior
+from dtprob.inference.target import Evaluation, Inputs, Target
+from dtprob.models.declaration import trace_model
+
+_BATCH_ENTRIES = 2_000_000
+_RECORDED = ("jax", "numpyro", "blackjax")
+
+
+def assemble(
+    target: Target,
+    inputs: Inputs,
+    positions: Float[Array, "chain draw dimension"] | np.ndarray,
+    *,
+    engine: AbstractEngine,
+    key: PRNGKeyArray,
+    options: RunOptions,
+    stats: Mapping[str, np.ndarray] | None = None,
+    extra: Mapping[str, Any] | None = None,
+) -> Posterior:
+    """The posterior of draws in unconstrained coordinates.
+
+    Args:
+        target: the target that the engine worked on.
+        inputs: its arrays.
+        positions: the draws, (chain, draw, dimension).
+        engine: who made them, for the provenance.
+        key: the run's key, for the provenance.
+        options: which sites to keep.
+        stats: per-draw statistics, (chain, draw); what is missing is filled in as for independent draws.
+        extra: what the engine knows beyond the draws.
+    """
+    chains, draws = positions.shape[:2]
+    shapes = jax.eval_shape(target.compiled(Target.evaluate), positions[0, 0], inputs)
+    kept, left_out = _kept_sites(target, shapes, options, chains * draws)
+    flat = jnp.asarray(positions).reshape(chains * draws, target.dimension)
+    push = target.compiled(_push, kept, _batch_size(shapes, chains * draws))
+    values, pointwise, lp = jax.tree.map(
+        lambda x: np.asarray(x).reshape(chains, draws, *x.shape[1:]), push(flat, inputs)
+    )
+    declaration = target.declaration
+    sites = [name for name in declaration.sites if name in values]
+    return Posterior(
+        draws={name: values[name] for name in sites},
+        sample_stats=_independent_stats(lp) | dict(stats or {}),
+        log_likelihood=pointwise,
+        observed=observed_data(target, inputs),
+        axes={name: site.axes for name, site in declaration.sites.items()},
+        latent=tuple(target.coordinates),
+        circular=tuple(name for name in sites if declaration.sites[name].is_circular),
+        extra={name: np.asarray(value) for name, value in (extra or {}).items()},
+        provenance=provenance(target, inputs, engine, key) | {"left_out": left_out},
+    )
+
+
+def provenance(target: Target, inputs: Inputs, engine: AbstractEngine, key: PRNGKeyArray) -> dict[str, Any]:
+    """What made a posterior: versions, engine and settings, model, key, hash of the data."""
+    return {
+        "dtprob": dtprob.__version__,
+        "versions": {name: importlib.metadata.version(name) for name in _RECORDED},
+        "engine": engine.name,
+        "settings": {name: _plain(value) for name, value in _settings(engine).items()},
+        "model": target.declaration.name,
+        "key": [str(jax.random.key_impl(key)), *np.ravel(jax.random.key_data(key)).tolist()],
+        "data_sha256": data_hash(inputs),
+    }
+
+
+def data_hash(inputs: Inputs) -> str:
+    """SHA-256 over names, shapes, types and values of the data's arrays."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(inputs.arrays):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{jax.tree_util.keystr(path)} {array.shape} {array.dtype.str}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def observed_data(target: Target, inputs: Inputs) -> dict[str, np.ndarray]:
+    """The data of each observed site."""
+    return jax.tree.map(np.asarray, target.compiled(_observed)(inputs))
+
+
+def _observed(target: Target, inputs: Inputs) -> dict[str, Array]:
+    trace = trace_model(target.model, target.data(inputs), jax.random.key(0))
+    return {name: jnp.asarray(trace[name]["value"]) for name in target.declaration.observed}
+
+
+def _settings(engine: AbstractEngine) -> dict[str, Any]:
+    return {f.name: getattr(engine, f.name) for f in fields(cast("Any", engine))}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(name): _plain(entry) for name, entry in value.items()}
+    return value if isinstance(value, str | int | float | bool | None) else np.asarray(value).tolist()
+
+
+def _independent_stats(lp: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        "lp": lp,
+        "energy": -lp,
+        "diverging": np.zeros(lp.shape, dtype=bool),
+        "tree_depth": np.zeros(lp.shape, dtype=int),
+        "acceptance_rate": np.ones(lp.shape),
+        "step_size": np.zeros(lp.shape),
+    }
+
+
+type _Kept = tuple[tuple[str, ...], tuple[str, ...]]
+
+
+def _kept_sites(
+    target: Target, shapes: Evaluation, options: RunOptions, draws: int
+) -> tuple[_Kept, list[str]]:
+    """(value sites, pointwise sites) to keep, and the names left out for their size."""
+    values, pointwise, left_out = [], [], []
+    for name, site in target.declaration.sites.items():
+        wanted = options.pointwise if site.kind == "observed" else options.deterministics
+        entries = shapes.log_likelihood if site.kind == "observed" else shapes.values
+        chosen = pointwise if site.kind == "observed" else values
+        if site.kind == "latent" or (wanted and draws * entries[name].size <= options.max_entries):
+            chosen.append(name)
+        elif wanted:
+            left_out.append(name)
+    return (tuple(values), tuple(pointwise)), left_out
+
+
+def _batch_size(shapes: Evaluation, draws: int) -> int:
+    """How many draws to evaluate at once: a divisor of `draws` that bounds the memory."""
+    entries = sum(x.size for x in jax.tree.leaves((shapes.values, shapes.log_likelihood)))
+    limit = max(1, min(draws, _BATCH_ENTRIES // max(entries, 1)))
+    return max(size for size in range(1, limit + 1) if draws % size == 0)
+
+
+def _push(
+    target: Target, kept: _Kept, batch: int, positions: Float[Array, "draw dimension"], inputs: Inputs
+) -> tuple[dict[str, Array], dict[str, Array], Float[Array, " draw"]]:
+    def one(u: Float[Array, " dimension"]) -> tuple[dict[str, Array], dict[str, Array], Array]:
+        run = target.evaluate(u, inputs)
+        values = {name: run.values[name] for name in kept[0]}
+        pointwise = {name: run.log_likelihood[name] for name in kept[1]}
+        return values, pointwise, sum(run.terms, start=jnp.zeros(()))
+
+    return jax.lax.map(one, positions, batch_size=batch)

@@ -1,0 +1,154 @@
+"""From a model and data to a target: its checks, its coordinates and their units, what is compiled once."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+from numpyro.distributions import biject_to, constraints
+
+from dtprob.errors import InputError
+from dtprob.inference.circular import mean_direction
+from dtprob.inference.target import Coordinates, Inputs, Target, free_value
+from dtprob.models.declaration import (
+    Data,
+    Model,
+    base_constraint,
+    declare,
+    model_name,
+    split_static,
+    trace_model,
+)
+
+_NORMAL_IQR = 1.349
+_KEPT_TARGETS = 32
+
+
+def build_target(model: Model, data: Data) -> tuple[Target, Inputs]:
+    """The target of a model on data, and the arrays that its functions take.
+
+    Data of the same shapes and settings give the same target object, so that what was compiled for one
+    serves the other.
+
+    Raises:
+        InputError: the data do not fit the model; or the model has a discrete or complex latent site, a
+            parameter site, a plate that subsamples, or nothing latent.
+    """
+    arrays, static = split_static(data)
+    arrays = jax.tree.map(jnp.asarray, arrays)
+    target = _TARGETS.get(model, arrays, static)
+    bare = Inputs(arrays, jnp.zeros(target.dimension), jnp.ones(target.dimension))
+    draws = target.compiled(Target.prior_draws)(jax.random.key(0), bare, {})
+    return target, Inputs(arrays, *_prior_units(target, np.asarray(draws)))
+
+
+def _prior_units(target: Target, draws: np.ndarray) -> tuple[Array, Array]:
+    with np.errstate(invalid="ignore"):
+        low, middle, high = np.quantile(draws, [0.25, 0.5, 0.75], axis=0)
+        spread = (high - low) / _NORMAL_IQR
+        usable = np.isfinite(middle) & np.isfinite(spread) & (spread > 0)
+    location = np.where(usable, middle, 0.0)
+    scale = np.where(usable, spread, 1.0)
+    direction = mean_direction(draws)
+    return (
+        jnp.asarray(np.where(target.circular, direction, location)),
+        jnp.asarray(np.where(target.circular, 1.0, scale)),
+    )
+
+
+class _TargetCache:
+    """The latest targets, by model, settings and shapes; a target goes with what was compiled for it."""
+
+    def __init__(self) -> None:
+        self._kept: OrderedDict[Any, Target] = OrderedDict()
+
+    def get(self, model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Target:
+        signature = _signature(model, arrays, static)
+        if signature not in self._kept:
+            self._kept[signature] = _make_target(model, arrays, static)
+        self._kept.move_to_end(signature)
+        while len(self._kept) > _KEPT_TARGETS:
+            self._kept.popitem(last=False)
+        return self._kept[signature]
+
+
+_TARGETS = _TargetCache()
+
+
+def _signature(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Any:
+    leaves, structure = jax.tree.flatten(arrays)
+    settings, settings_structure = jax.tree.flatten(static)
+    shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
+    return model, structure, shapes, settings_structure, tuple(settings), jax.config.jax_enable_x64
+
+
+def _make_target(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Target:
+    declaration = declare(model, eqx.combine(arrays, static))
+    shapes = _unconstrained_shapes(model, arrays, static)
+    if not declaration.latent:
+        remedy = "Sample at least one unknown with numpyro.sample"
+        raise InputError(f"model {declaration.name}", "a latent site", "none", remedy)
+    coordinates: dict[str, Coordinates] = {}
+    start = 0
+    for name, site in declaration.latent.items():
+        stop = start + int(np.prod(shapes[name], dtype=int))
+        coordinates[name] = Coordinates(start, stop, shapes[name], site.is_circular)
+        start = stop
+    circular = np.zeros(start, dtype=bool)
+    for place in coordinates.values():
+        circular[place.start : place.stop] = place.is_circular
+    return Target(model, declaration, coordinates, static, circular)
+
+
+def _unconstrained_shapes(
+    model: Model, arrays: dict[str, Any], static: dict[str, Any]
+) -> dict[str, tuple[int, ...]]:
+    shapes: dict[str, tuple[int, ...]] = {}
+
+    def run(traced: dict[str, Any], key: Array) -> None:
+        trace = trace_model(model, eqx.combine(traced, static), key)
+        for name, message in trace.items():
+            _refuse_message(model, name, message)
+            if message["type"] == "sample" and not message["is_observed"]:
+                shapes[name] = tuple(jnp.shape(free_value(message)))
+
+    jax.eval_shape(run, arrays, jax.random.key(0))
+    return shapes
+
+
+def _refuse_message(model: Model, name: str, message: Mapping[str, Any]) -> None:
+    what = f"model {model_name(model)}"
+    if message["type"] == "param":
+        remedy = "Declare it with numpyro.sample and a prior"
+        raise InputError(what, "latent sites with priors", f"the parameter site {name!r}", remedy)
+    if message["type"] == "plate":
+        size, subsample = message["args"]
+        if subsample is not None and subsample != size:
+            got = f"plate {name!r} that takes {subsample} of {size}"
+            raise InputError(what, "plates without subsampling", got, "Give the plate its full size")
+    if message["type"] == "sample" and not message["is_observed"]:
+        _refuse_latent(what, name, message["fn"])
+
+
+def _refuse_latent(what: str, name: str, fn: Any) -> None:
+    support = base_constraint(fn.support)
+    kind = f"{name!r} ({type(fn).__name__})"
+    if support is None or support.is_discrete:
+        remedy = "Sum it out in the model (numpyro.factor), since the density must have a gradient"
+        raise InputError(what, "continuous latent sites", f"the discrete latent site {kind}", remedy)
+    if support is constraints.complex:
+        remedy = "Sample its real and imaginary parts as two sites"
+        raise InputError(what, "real latent sites", f"the complex latent site {kind}", remedy)
+    if support is not constraints.circular:
+        try:
+            biject_to(fn.support)
+        except NotImplementedError:
+            remedy = "Sample a real or positive site and compute it from that"
+            got = f"the latent site {kind}"
+            raise InputError(what, "supports that NumPyro maps to the reals", got, remedy) from None

@@ -1,0 +1,145 @@
+"""The device's side of a Markov chain run: pure functions of all chains' states."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+from dtprob.inference.kernel import Kernel, Place, window_of
+from dtprob.inference.target import Inputs, Target
+from dtprob.inference.winding import recentred, redraw_winding
+
+type ChainMethod = Literal["sequential", "vectorized"]
+
+START, STEP = 0, 1
+
+
+@dataclass(frozen=True)
+class Walk:
+    """How chains move; hashable, so that it is a setting of compiled functions.
+
+    Attributes:
+        kernel: the transition.
+        method: chains one after the other, or side by side.
+        explore: steps before the angles' windows are centred, when the kernel starts anew; 0 without angles.
+        warmup: steps in all that are not kept.
+    """
+
+    kernel: Kernel
+    method: ChainMethod
+    explore: int
+    warmup: int
+
+    def over_chains(self, function: Callable[..., Any], *stacked: Any) -> Any:
+        """`function` for each chain, arguments and results stacked on a leading axis."""
+        if self.method == "vectorized":
+            return jax.vmap(function)(*stacked)
+        return jax.lax.map(lambda arguments: function(*arguments), stacked)
+
+
+class Chain(NamedTuple):
+    """State of one chain; all chains of a run are stacked on a leading axis.
+
+    Attributes:
+        kernel: the kernel's own state.
+        centre: centres of the angles' windows, rad.
+        resultant: running sum of (cos, sin) of the angles, from which the centres are found.
+    """
+
+    kernel: Any
+    centre: Float[Array, " angle"]
+    resultant: Float[Array, "angle 2"]
+
+
+def start(
+    target: Target,
+    walk: Walk,
+    points: Float[Array, "chain dimension"],
+    keys: PRNGKeyArray,
+    inputs: Inputs,
+) -> Chain:
+    """The chains at their starting points, nothing adapted yet."""
+
+    def one(point: Array, key: PRNGKeyArray) -> Chain:
+        return _begin(target, walk, point, point[target.angles], key, inputs)
+
+    return walk.over_chains(one, points, keys)
+
+
+def recentre(target: Target, walk: Walk, chains: Chain, keys: PRNGKeyArray, inputs: Inputs) -> Chain:
+    """The chains with windows centred on their mean directions so far, and nothing adapted yet."""
+
+    def one(chain: Chain, key: PRNGKeyArray) -> Chain:
+        centre = jnp.arctan2(chain.resultant[:, 1], chain.resultant[:, 0])
+        point = walk.kernel.position(chain.kernel)
+        point = point.at[target.angles].set(recentred(point[target.angles], centre))
+        return _begin(target, walk, point, centre, key, inputs)
+
+    return walk.over_chains(one, chains, keys)
+
+
+def advance(  # noqa: PLR0917  (settings first, since they are bound before compilation)
+    target: Target,
+    walk: Walk,
+    chunk: int,
+    chains: Chain,
+    keys: PRNGKeyArray,
+    begin: Int[Array, ""],
+    end: Int[Array, ""],
+    inputs: Inputs,
+) -> tuple[Chain, dict[str, Array]]:
+    """Steps `begin` to `end` of all chains.
+
+    Returns:
+        the chains, and by name the positions and statistics of each step, (chain, chunk, ...); rows from
+        end - begin on are empty.
+    """
+
+    def one(chain: Chain, key: PRNGKeyArray) -> tuple[Chain, dict[str, Array]]:
+        def body(number: Array, carry: tuple[Chain, dict[str, Array]]) -> tuple[Chain, dict[str, Array]]:
+            moved, row = _step(target, walk, carry[0], jax.random.fold_in(key, number), number, inputs)
+            return moved, jax.tree.map(lambda block, x: block.at[number - begin].set(x), carry[1], row)
+
+        rows = jax.eval_shape(lambda: _step(target, walk, chain, key, begin, inputs)[1])
+        empty = jax.tree.map(lambda x: jnp.zeros((chunk, *x.shape), x.dtype), rows)
+        return jax.lax.fori_loop(begin, end, body, (chain, empty))
+
+    return walk.over_chains(one, chains, jax.vmap(jax.random.fold_in, (0, None))(keys, STEP))
+
+
+def _begin(  # noqa: PLR0917
+    target: Target, walk: Walk, point: Array, centre: Array, key: PRNGKeyArray, inputs: Inputs
+) -> Chain:
+    state = walk.kernel.init(target, jax.random.fold_in(key, START), point, Place(centre, inputs))
+    return Chain(state, centre, jnp.zeros((*centre.shape, 2), point.dtype))
+
+
+def _step(  # noqa: PLR0917
+    target: Target, walk: Walk, chain: Chain, key: PRNGKeyArray, number: Array, inputs: Inputs
+) -> tuple[Chain, dict[str, Array]]:
+    move_key, winding_key = jax.random.split(key)
+    index = jnp.where(number < walk.explore, number, number - walk.explore)
+    state, stats = walk.kernel.step(target, move_key, chain.kernel, index, Place(chain.centre, inputs))
+    chain = chain._replace(kernel=state)
+    if target.angles.size:
+        chain = _turn(target, walk, chain, winding_key, number)
+    return chain, {"position": walk.kernel.position(chain.kernel), **stats._asdict()}
+
+
+def _turn(target: Target, walk: Walk, chain: Chain, key: PRNGKeyArray, number: Array) -> Chain:
+    """Follow the angles while exploring; redraw their winding numbers once draws are kept."""
+    before = walk.kernel.position(chain.kernel)
+    angles = before[target.angles]
+    follows = (number >= walk.explore // 2) & (number < walk.explore)
+    direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+    chain = chain._replace(resultant=chain.resultant + follows * direction)
+    after = before.at[target.angles].set(redraw_winding(key, angles, chain.centre))
+    after = jnp.where(number >= walk.warmup, after, before)
+    window = jax.value_and_grad(lambda u: window_of(target, u, chain.centre))
+    (old, old_slope), (new, new_slope) = window(before), window(after)
+    return chain._replace(kernel=walk.kernel.shift(chain.kernel, after, new - old, new_slope - old_slope))

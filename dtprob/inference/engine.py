@@ -1,0 +1,123 @@
+"""The contract of an inference engine, and the options that every run understands."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar, Literal
+
+import jax
+
+from dtprob.errors import InputError
+from dtprob.inference.posterior import Posterior
+from dtprob.models.declaration import Model
+
+type Answer = Literal["exact", "approximation", "point"]
+type Serves = Literal["continuous", "circular"]
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """What a run does besides inferring; no option changes a draw.
+
+    Attributes:
+        progress: tell the progress on standard error, as a bar on a terminal and as plain lines elsewhere.
+        status_file: a JSON file that always holds the latest progress.
+        checkpoint: a file that holds the state of the run, replaced after every chunk; kept by the engines
+            that draw chains, while the others finish in one piece.
+        resume: continue from `checkpoint` where it exists.
+        chunk: draws between two checkpoints or progress reports.
+        deterministics: keep the model's deterministic sites among the draws.
+        pointwise: keep the log likelihood of every observation for every draw.
+        max_entries: a deterministic site or log likelihood with more entries than this over all draws is left
+            out; the posterior's provenance names it.
+    """
+
+    progress: bool = False
+    status_file: Path | None = None
+    checkpoint: Path | None = None
+    resume: bool = False
+    chunk: int = 100
+    deterministics: bool = True
+    pointwise: bool = True
+    max_entries: int = 20_000_000
+
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        if self.chunk < 1:
+            raise InputError("chunk of a run", "1 or more draws", str(self.chunk), "Give a positive number")
+        if self.resume and self.checkpoint is None:
+            raise InputError("resume", "a checkpoint file", "none", "Give the file of the interrupted run")
+
+
+DEFAULT = RunOptions()
+
+
+class AbstractEngine(abc.ABC):
+    """Something that turns a model and data into a posterior.
+
+    A concrete engine is a frozen dataclass whose fields are its settings. Calling it twice with the same key,
+    model and data gives the same draws.
+
+    Attributes:
+        name: the engine's name in `ENGINES`, on the command line and in provenance.
+        answer: "exact" when its draws come from the posterior, "approximation" when from a stand-in, "point"
+            when there is a single value.
+        serves: "continuous" for any model with continuous latent sites, "circular" where it needs circular
+            ones.
+    """
+
+    name: ClassVar[str]
+    answer: ClassVar[Answer]
+    serves: ClassVar[Serves] = "continuous"
+
+    @abc.abstractmethod
+    def __call__(
+        self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
+    ) -> Posterior:
+        """Infer.
+
+        Args:
+            key: typed JAX key.
+            model: a NumPyro model.
+            data: its arguments by name, the observed ones present.
+            options: progress, checkpoints, what to keep.
+
+        Returns:
+            draws of every latent site, laid out (chain, draw, *event).
+
+        Raises:
+            InputError: the data do not fit the model, or the engine cannot serve the model.
+        """
+
+
+def check_counts(engine: AbstractEngine, least: Mapping[str, int]) -> None:
+    """Check an engine's settings that are counts.
+
+    Args:
+        engine: the engine.
+        least: for each setting, the smallest number that works.
+
+    Raises:
+        InputError: a setting is smaller.
+    """
+    for name, bound in least.items():
+        value = getattr(engine, name)
+        if value < bound:
+            what = f"{name} of engine {engine.name}"
+            raise InputError(what, f"{bound} or more", str(value), f"Give a larger {name}")
+
+
+def check_key(key: jax.Array) -> jax.Array:
+    """The key itself, when it is a single typed JAX key.
+
+    Raises:
+        InputError: anything else, such as an integer seed or an untyped key.
+    """
+    is_typed = isinstance(key, jax.Array) and jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key)
+    if not is_typed or key.shape != ():
+        got = f"{type(key).__name__} of shape {getattr(key, 'shape', ())}"
+        raise InputError("key", "one typed JAX key", got, "Make it with jax.random.key(seed)")
+    return key

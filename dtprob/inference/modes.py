@@ -1,0 +1,142 @@
+"""The mode of a target, found from several starts."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, Scalar
+
+from dtprob.errors import InputError
+from dtprob.inference.optimise import Optimum, best, minimise
+from dtprob.inference.target import Inputs, Target
+
+type Objective = Literal["density", "map", "maximum_likelihood"]
+
+_CANDIDATES = 4
+_SAME_NATS = 1e-3
+
+
+class Mode(NamedTuple):
+    """The best optimum over the starts.
+
+    Attributes:
+        optimum: where it is and whether the search arrived.
+        agreeing: share of the starts that ended within a thousandth of a nat of it.
+    """
+
+    optimum: Optimum
+    agreeing: Scalar
+
+    def facts(self) -> dict[str, Array]:
+        """The entries of a posterior's `extra` that say how the search went."""
+        found = self.optimum
+        return {"converged": found.converged, "promise": found.promise, "agreeing": self.agreeing}
+
+
+def objective_value(
+    target: Target, objective: Objective, u: Float[Array, " dimension"], inputs: Inputs
+) -> Scalar:
+    """The negative log density that a mode minimises.
+
+    Args:
+        target: the target.
+        objective: "density" for the density over the unconstrained coordinates (what Laplace's method needs),
+            "map" for prior times likelihood over the constrained values, "maximum_likelihood" without the
+            prior.
+        u: the point.
+        inputs: the target's arrays.
+    """
+    terms = target.log_terms(u, inputs)
+    if objective == "density":
+        return -sum(terms, start=jnp.zeros(()))
+    return -terms.likelihood if objective == "maximum_likelihood" else -(terms.prior + terms.likelihood)
+
+
+def find_mode(
+    target: Target,
+    inputs: Inputs,
+    key: PRNGKeyArray,
+    *,
+    objective: Objective,
+    initial: Mapping[str, Any] | None,
+    starts: int,
+    max_steps: int,
+) -> Mode:
+    """The lowest of the local minima reached from several starts.
+
+    The first start is the prior's median, the others the best of four times as many prior draws; sites with
+    an initial value start there, and where every site has one there is a single start.
+
+    Args:
+        target: the target.
+        inputs: its arrays.
+        key: typed JAX key, for the starts.
+        objective: see `objective_value`.
+        initial: constrained values of some sites.
+        starts: how many.
+        max_steps: bound on the steps of each.
+
+    Raises:
+        InputError: the density is not finite at any start.
+    """
+    values = target.latent_values(initial or {})
+    count = 1 if len(values) == len(target.coordinates) else starts
+    points = starting_points(target, inputs, key, objective=objective, values=values, starts=count)
+    mode: Mode = target.compiled(_search, objective, max_steps)(points, inputs)
+    if not bool(jnp.isfinite(mode.optimum.value)):
+        what = f"model {target.declaration.name}"
+        remedy = "Give initial values, or check that the data are finite and within the model's supports"
+        raise InputError(what, "a finite log density", "none at any start", remedy)
+    return mode
+
+
+def _search(
+    target: Target,
+    objective: Objective,
+    max_steps: int,
+    points: Float[Array, "start dimension"],
+    inputs: Inputs,
+) -> Mode:
+    def function(u: Array) -> Array:
+        return objective_value(target, objective, u, inputs)
+
+    optima = jax.vmap(lambda point: minimise(function, point, max_steps))(points)
+    lowest = best(optima)
+    return Mode(lowest, jnp.mean(optima.value <= lowest.value + _SAME_NATS, dtype=lowest.value.dtype))
+
+
+def starting_points(
+    target: Target,
+    inputs: Inputs,
+    key: PRNGKeyArray,
+    *,
+    objective: Objective,
+    values: Mapping[str, Array],
+    starts: int,
+) -> Float[Array, "start dimension"]:
+    """Where to start: the prior's median, then the best of four times as many prior draws.
+
+    Args:
+        target: the target.
+        inputs: its arrays.
+        key: typed JAX key.
+        objective: what "best" means.
+        values: constrained values of the sites that are given.
+        starts: how many.
+    """
+    first = target.compiled(Target.prior_median)(inputs, values)[None]
+    if starts == 1:
+        return first
+    drawn = target.compiled(Target.prior_draws)(key, inputs, values)[: _CANDIDATES * (starts - 1)]
+    heights = target.compiled(_heights, objective)(drawn, inputs)
+    return jnp.concatenate([first, drawn[jnp.argsort(heights)[: starts - 1]]])
+
+
+def _heights(
+    target: Target, objective: Objective, points: Float[Array, "point dimension"], inputs: Inputs
+) -> Float[Array, " point"]:
+    heights = jax.lax.map(lambda u: objective_value(target, objective, u, inputs), points)
+    return jnp.where(jnp.isfinite(heights), heights, jnp.inf)

@@ -1,0 +1,129 @@
+"""The No-U-Turn sampler of NumPyro.
+
+Source: Hoffman and Gelman, The No-U-Turn Sampler (2014); Phan, Pradhan and Jankowiak, Composable effects for
+flexible and accelerated probabilistic programming in NumPyro (2019).
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+from numpyro.infer.hmc import HMCState, hmc
+
+from dtprob.inference.chains import ChainMethod
+from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions
+from dtprob.inference.kernel import Place, Stats, lifted_log_density
+from dtprob.inference.posterior import Posterior
+from dtprob.inference.run import Schedule, run_chains
+from dtprob.inference.target import Target
+from dtprob.models.declaration import Model
+
+
+@dataclass(frozen=True)
+class NumPyroKernel:
+    """NumPyro's transition; see `dtprob.inference.kernel.Kernel`."""
+
+    warmup: int
+    target_accept: float
+    max_tree_depth: int
+    dense_mass: bool
+
+    def init(self, target: Target, key: PRNGKeyArray, position: Array, place: Place) -> HMCState:
+        """State of a chain that starts at a position."""
+        return _without_keys(self._functions(target)[0](position, place=place, key=key))
+
+    def step(
+        self, target: Target, key: PRNGKeyArray, state: HMCState, index: Array, place: Place
+    ) -> tuple[HMCState, Stats]:
+        """One transition; NumPyro counts the steps in its own state."""
+        del index
+        start, step = self._functions(target)
+        jax.eval_shape(functools.partial(start, place=place, key=key), state.z)  # binds the warm-up's length
+        moved: HMCState = step(state._replace(rng_key=key), model_args=(place,))
+        depth = jnp.floor(jnp.log2(jnp.maximum(moved.num_steps, 1))).astype(int) + 1
+        stats = Stats(moved.diverging, moved.energy, depth, moved.accept_prob, moved.adapt_state.step_size)
+        return _without_keys(moved), stats
+
+    def position(self, state: HMCState) -> Float[Array, " dimension"]:
+        """Where the chain is."""
+        return state.z
+
+    def shift(self, state: HMCState, position: Array, log_density: Array, gradient: Array) -> HMCState:
+        """The state at another position."""
+        return state._replace(
+            z=position,
+            potential_energy=state.potential_energy - log_density,
+            z_grad=state.z_grad - gradient,
+        )
+
+    def _functions(self, target: Target) -> tuple[Callable[..., HMCState], Callable[..., HMCState]]:
+        def potential_for(place: Place) -> Callable[[Array], Array]:
+            return lambda u: -lifted_log_density(target, u, place)
+
+        init, step = hmc(potential_fn_gen=potential_for, algo="NUTS")
+
+        def start(position: Array, *, place: Place, key: PRNGKeyArray) -> HMCState:
+            return init(
+                position,
+                num_warmup=self.warmup,
+                dense_mass=self.dense_mass,
+                target_accept_prob=self.target_accept,
+                max_tree_depth=self.max_tree_depth,
+                model_args=(place,),
+                rng_key=key,
+            )
+
+        return start, step
+
+
+def _without_keys(state: HMCState) -> HMCState:
+    return state._replace(rng_key=None, adapt_state=state.adapt_state._replace(rng_key=None))
+
+
+@dataclass(frozen=True)
+class NUTS(AbstractEngine):
+    """The No-U-Turn sampler of NumPyro, with windowed adaptation.
+
+    A draw depends on the key, its chain and its place in the chain; not on chunks, interruptions, or how many
+    chains or draws there are. Angles do not get stuck at +-pi; see `dtprob.inference.winding`.
+
+    Attributes:
+        draws: draws of each chain.
+        warmup: steps of each chain before them, in which it adapts.
+        chains: how many chains.
+        target_accept: acceptance rate that the step size is adapted to.
+        max_tree_depth: bound on the doublings of a trajectory.
+        dense_mass: adapt a full mass matrix rather than a diagonal one.
+        chain_method: "sequential" or "vectorized": chains one after the other, or side by side, which is
+            faster on a GPU but makes the last bits of a draw depend on the number of chains.
+        initial: constrained values that every chain starts from; sites without one start from the prior.
+    """
+
+    name: ClassVar[str] = "nuts"
+    answer: ClassVar[Answer] = "exact"
+
+    draws: int = 1000
+    warmup: int = 1000
+    chains: int = 4
+    target_accept: float = 0.8
+    max_tree_depth: int = 10
+    dense_mass: bool = False
+    chain_method: ChainMethod = "sequential"
+    initial: Mapping[str, Any] | None = None
+
+    def __call__(
+        self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
+    ) -> Posterior:
+        """Infer; see `AbstractEngine`."""
+
+        def kernel(warmup: int) -> NumPyroKernel:
+            return NumPyroKernel(warmup, self.target_accept, self.max_tree_depth, self.dense_mass)
+
+        schedule = Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial)
+        return run_chains(self, kernel, schedule, key, model=model, data=data, options=options)

@@ -1,0 +1,84 @@
+"""A least-squares start for the phases of Gaussian observations.
+
+Where every observation is normal with a mean affine in x_e = (cos z_e, sin z_e), the x_e are found as if
+they were free, and their directions kept: the reference E-step of Ruah et al. (arXiv 2312.12625), with the
+prior's natural parameter added to the right-hand side. It needs only the observations' means as functions
+of the angles.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from dtprob.inference.relaxation import Layout, Resultants
+from dtprob.inference.target import Inputs, Target
+
+_NORMAL = ("Normal", "ComplexNormal")
+_ITERATIONS = 200
+
+
+def is_gaussian(target: Target) -> bool:
+    """Whether every observed site is normal, real or complex."""
+    return all(site.distribution in _NORMAL for site in target.declaration.observed.values())
+
+
+def least_squares_start(
+    target: Target, layout: Layout, rest: Float[Array, " dimension"], inputs: Inputs
+) -> Resultants:
+    """Angles by least squares on the phasors.
+
+    Args:
+        target: a target whose observations are Gaussian.
+        layout: the groups and colours of the angles.
+        rest: all coordinates; those of the angles are not used.
+        inputs: the target's arrays.
+    """
+    zero = jnp.zeros(target.angles.shape, rest.dtype)
+    quarter = zero + 0.5 * jnp.pi
+    data, _, weight = _observations(target, zero, rest, inputs)
+
+    def mean(angles: Array) -> Array:
+        return _observations(target, angles, rest, inputs)[1]
+
+    def forward(x: Array) -> Array:
+        from_cos = jax.jvp(mean, (quarter,), (-x[:, 0],))[1]
+        return from_cos + jax.jvp(mean, (zero,), (x[:, 1],))[1]
+
+    base = 0.5 * (mean(zero) + mean(zero + jnp.pi))
+    start = jnp.zeros((zero.shape[0], 2), rest.dtype)
+    _, backward = jax.vjp(forward, start)
+    right = backward(weight * (data - base))[0] + _prior_parameter(target, rest, inputs)
+    found, _ = jax.scipy.sparse.linalg.cg(
+        lambda x: backward(weight * forward(x))[0], right, maxiter=_ITERATIONS, tol=1e-8
+    )
+    found = jnp.where(jnp.isfinite(found), found, 0.0)
+    found = found[layout.table]
+    length = jnp.minimum(jnp.linalg.norm(found, axis=-1), 1.0)
+    return Resultants(jnp.arctan2(found[..., 1], found[..., 0]), length)
+
+
+def _prior_parameter(target: Target, rest: Array, inputs: Inputs) -> Float[Array, "angle 2"]:
+    """D log prior / d x of each entry."""
+
+    def prior(angles: Array) -> Array:
+        return target.log_terms(rest.at[target.angles].set(angles), inputs).prior
+
+    zero = jnp.zeros(target.angles.shape, rest.dtype)
+    return jnp.stack([-jax.grad(prior)(zero + 0.5 * jnp.pi), jax.grad(prior)(zero)], axis=-1)
+
+
+def _observations(target: Target, angles: Array, rest: Array, inputs: Inputs) -> tuple[Array, Array, Array]:
+    """Data, means and weights (one over the variance) of all observations, as real vectors."""
+    _, trace = target.trace(rest.at[target.angles].set(angles), inputs)
+    parts: list[tuple[Array, Array, Array]] = []
+    for name in target.declaration.observed:
+        fn, value = trace[name]["fn"], jnp.asarray(trace[name]["value"])
+        mean, weight = jnp.broadcast_to(fn.mean, value.shape), jnp.broadcast_to(1 / fn.variance, value.shape)
+        if jnp.iscomplexobj(value):
+            parts += [(value.real, mean.real, 2 * weight), (value.imag, mean.imag, 2 * weight)]
+        else:
+            parts.append((value, mean, weight))
+    data, means, weights = zip(*parts, strict=True)
+    return tuple(jnp.concatenate([x.ravel() for x in xs]) for xs in (data, means, weights))  # pyright: ignore[reportReturnType]

@@ -1,0 +1,197 @@
+"""The one run loop of all Markov chain engines: chunks, progress, checkpoint, resume.
+
+Chains advance a chunk of steps per call of one compiled function, and each chunk's draws go to the host.
+The key of a step is folded from the run's key, the chain and the step's number, so a draw does not depend
+on where chunks end, on an interruption, or on how many chains and draws there are.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from dtprob.errors import InputError
+from dtprob.inference import checkpoint
+from dtprob.inference.assemble import assemble, provenance
+from dtprob.inference.build import build_target
+from dtprob.inference.chains import START, Chain, ChainMethod, Walk, advance, recentre, start
+from dtprob.inference.engine import AbstractEngine, RunOptions, check_counts, check_key
+from dtprob.inference.kernel import Kernel
+from dtprob.inference.modes import starting_points
+from dtprob.inference.posterior import Posterior
+from dtprob.inference.progress import Progress
+from dtprob.inference.target import Inputs, Target
+from dtprob.models.declaration import Model
+
+_EXPLORE_SHARE = 5
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """How long a run is.
+
+    Attributes:
+        chains: number of chains.
+        warmup: steps of each chain that are not kept.
+        draws: steps of each chain that are.
+        method: chains one after the other ("sequential") or side by side ("vectorized").
+        initial: constrained values that the chains start from.
+    """
+
+    chains: int
+    warmup: int
+    draws: int
+    method: ChainMethod
+    initial: Mapping[str, Any] | None = None
+
+    @property
+    def total(self) -> int:
+        """All steps of a chain."""
+        return self.warmup + self.draws
+
+
+def run_chains(
+    engine: AbstractEngine,
+    kernel_for: Callable[[int], Kernel],
+    schedule: Schedule,
+    key: PRNGKeyArray,
+    *,
+    model: Model,
+    data: Mapping[str, Any],
+    options: RunOptions,
+) -> Posterior:
+    """Run a Markov chain kernel and return the posterior.
+
+    Args:
+        engine: who runs, for the provenance.
+        kernel_for: warm-up length -> kernel.
+        schedule: chains, warm-up, draws.
+        key: typed JAX key.
+        model: the NumPyro model.
+        data: its arguments by name.
+        options: progress, checkpoint, what to keep.
+
+    Raises:
+        InputError: see `build_target`; or the checkpoint is another run's.
+    """
+    check_counts(engine, {"chains": 1, "warmup": 0, "draws": 1, "max_tree_depth": 1})
+    check_key(key)
+    target, inputs = build_target(model, data)
+    explore = schedule.warmup // _EXPLORE_SHARE if target.angles.size else 0
+    walk = Walk(kernel_for(schedule.warmup - explore), schedule.method, explore, schedule.warmup)
+    draws = _Loop(target, inputs, walk, schedule, key, options, engine).run()
+    positions = draws.pop("position")
+    return assemble(target, inputs, positions, engine=engine, key=key, options=options, stats=draws)
+
+
+@dataclass
+class _Loop:
+    """The host's side of a run: the only place with side effects."""
+
+    target: Target
+    inputs: Inputs
+    walk: Walk
+    schedule: Schedule
+    key: PRNGKeyArray
+    options: RunOptions
+    engine: AbstractEngine
+
+    def run(self) -> dict[str, np.ndarray]:
+        """All draws and statistics by name, (chain, draw, ...)."""
+        keys = jax.vmap(jax.random.fold_in, (None, 0))(self.key, jnp.arange(self.schedule.chains))
+        identity = self._identity() if self.options.checkpoint else {}
+        done, chains, kept = self._begin(keys, identity)
+        total = self.schedule.total
+        with Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress:
+            while done < total:
+                if done == self.walk.explore > 0:
+                    chains = self._compiled(recentre)(chains, keys, self.inputs)
+                end = self._chunk_end(done)
+                move = self._compiled(advance, self.options.chunk)
+                chains, block = move(chains, keys, done, end, self.inputs)
+                if done >= self.walk.warmup:
+                    kept.append(jax.tree.map(lambda x, rows=end - done: np.asarray(x[:, :rows]), block))
+                done = end
+                self._save(identity, done, chains, kept)
+                progress.report(done, "draws" if done > self.walk.warmup else "warmup", _note(kept))
+        return _joined(kept)
+
+    def _compiled(self, function: Callable[..., Any], *settings: Any) -> Callable[..., Any]:
+        return self.target.compiled(function, self.walk, *settings)
+
+    def _chunk_end(self, done: int) -> int:
+        """The end of the chunk that begins after `done` steps: no chunk crosses a phase."""
+        ends = (self.walk.explore, self.walk.warmup, self.schedule.total)
+        return min(done + self.options.chunk, *(end for end in ends if end > done))
+
+    def _begin(
+        self, keys: PRNGKeyArray, identity: Mapping[str, Any]
+    ) -> tuple[int, Chain, list[dict[str, np.ndarray]]]:
+        path = self.options.checkpoint
+        begin = self._compiled(start)
+        if not self.options.resume or path is None or not path.exists():
+            return 0, begin(self._starting_points(keys), keys, self.inputs), []
+        found = checkpoint.read(path, identity)
+        if found.done > self.schedule.total:
+            expected, got = f"at most {self.schedule.total} steps", str(found.done)
+            raise InputError(f"checkpoint {path}", expected, got, "Ask for as many draws as it has, or more")
+        points = jax.ShapeDtypeStruct((self.schedule.chains, self.target.dimension), jnp.zeros(0).dtype)
+        like = jax.eval_shape(begin, points, keys, self.inputs)
+        chains: Chain = checkpoint.restore(found.state, like, f"checkpoint {path}")
+        return found.done, chains, [found.draws] if found.draws else []
+
+    def _starting_points(self, keys: PRNGKeyArray) -> Float[Array, "chain dimension"]:
+        """For each chain the initial values, or the best of a few prior draws."""
+        values = self.target.latent_values(self.schedule.initial or {})
+        starts = 1 if len(values) == len(self.target.coordinates) else 2
+        points = [
+            starting_points(
+                self.target,
+                self.inputs,
+                jax.random.fold_in(key, START),
+                objective="density",
+                values=values,
+                starts=starts,
+            )[-1]
+            for key in keys
+        ]
+        return jnp.stack(points)
+
+    def _save(
+        self, identity: Mapping[str, Any], done: int, chains: Chain, kept: list[dict[str, np.ndarray]]
+    ) -> None:
+        if self.options.checkpoint is not None:
+            state = [np.asarray(leaf) for leaf in jax.tree.leaves(chains)]
+            snapshot = checkpoint.Snapshot(done, state, _joined(kept) if kept else {})
+            checkpoint.write(self.options.checkpoint, identity, snapshot)
+
+    def _identity(self) -> dict[str, Any]:
+        """Everything that the draws depend on, but for how many there are."""
+        facts = provenance(self.target, self.inputs, self.engine, self.key)
+        facts["settings"] = {name: value for name, value in facts["settings"].items() if name != "draws"}
+        return facts | {"density": _density_hash(self.target, self.inputs)}
+
+
+def _density_hash(target: Target, inputs: Inputs) -> str:
+    """SHA-256 of the log density's program, memory addresses left out."""
+    program = str(jax.make_jaxpr(target.log_density)(jnp.zeros(target.dimension), inputs))
+    return hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", program).encode()).hexdigest()
+
+
+def _joined(kept: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The blocks as one; the list then holds it alone."""
+    kept[:] = [{name: np.concatenate([block[name] for block in kept], axis=1) for name in kept[0]}]
+    return dict(kept[0])
+
+
+def _note(kept: list[dict[str, np.ndarray]]) -> str:
+    divergences = sum(int(block["diverging"].sum()) for block in kept)
+    return f"{divergences} diverging" if divergences else ""

@@ -1,0 +1,168 @@
+"""A posterior as an ArviZ DataTree and as a NetCDF file.
+
+The file is the DataTree, so that ArviZ and xarray read it as it is. What a DataTree cannot hold (complex
+numbers, two sizes of one axis) is written in another form, with attributes that say how to go back.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dtprob.errors import InputError
+from dtprob.files import atomic_write
+from dtprob.inference.posterior import Posterior
+
+FORMAT = "dtprob posterior 1"
+_ENGINE = "h5netcdf"
+_LEADING = ("chain", "draw")
+_PARTS = ("real", "imag")
+
+
+def to_datatree(posterior: Posterior) -> xr.DataTree:
+    """The posterior as a DataTree; see `Posterior.to_datatree`."""
+    axes = posterior.axes
+    stats = dict.fromkeys(posterior.sample_stats, ())
+    groups = {
+        "posterior": _dataset(posterior.draws, axes, _LEADING, posterior.coords),
+        "sample_stats": _dataset(posterior.sample_stats, stats, _LEADING, {}),
+        "log_likelihood": _dataset(posterior.log_likelihood, axes, _LEADING, posterior.coords),
+        "observed_data": _dataset(posterior.observed, axes, (), posterior.coords),
+        "extra": _dataset(posterior.extra, {}, (), {}),
+    }
+    filled = {name: dataset for name, dataset in groups.items() if name == "posterior" or dataset.data_vars}
+    tree = xr.DataTree.from_dict(filled)
+    tree.attrs = {
+        "format": FORMAT,
+        "provenance": json.dumps(posterior.provenance, sort_keys=True),
+        "axes": json.dumps({name: list(names) for name, names in axes.items()}),
+        "latent": json.dumps(list(posterior.latent)),
+        "circular": json.dumps(list(posterior.circular)),
+    }
+    return tree
+
+
+def save(posterior: Posterior, path: Path) -> None:
+    """Write the posterior's DataTree to NetCDF, whole or not at all."""
+    tree = to_datatree(posterior)
+    with atomic_write(path) as temporary:
+        tree.to_netcdf(temporary, engine=_ENGINE)
+
+
+def load(path: Path) -> Posterior:
+    """Read a posterior; see `Posterior.load`."""
+    if not path.is_file():
+        raise InputError(f"posterior file {path}", "an existing file", "none", "Check the path")
+    try:
+        with xr.open_datatree(path, engine=_ENGINE) as opened:
+            tree = opened.load()
+    except (OSError, ValueError) as error:
+        remedy = "Give a file that Posterior.save wrote"
+        raise InputError(f"posterior file {path}", "NetCDF", str(error).splitlines()[0], remedy) from error
+    return from_datatree(tree, f"posterior file {path}")
+
+
+def from_datatree(tree: xr.DataTree, what: str = "data tree") -> Posterior:
+    """The posterior that `to_datatree` made a tree of.
+
+    Args:
+        tree: the tree.
+        what: its name in error messages.
+
+    Raises:
+        InputError: the tree is not one of dtprob's, or of another version of the format.
+    """
+    found = tree.attrs.get("format")
+    if found != FORMAT:
+        remedy = "Read it with the version of dtprob that wrote it, or with arviz"
+        raise InputError(what, f"format '{FORMAT}'", repr(found), remedy)
+    coords = {
+        str(name): value.values
+        for group in tree.children.values()
+        for name, value in group.to_dataset().coords.items()
+        if name not in _LEADING
+    }
+    return Posterior(
+        draws=_group(tree, "posterior"),
+        sample_stats=_group(tree, "sample_stats"),
+        log_likelihood=_group(tree, "log_likelihood"),
+        observed=_group(tree, "observed_data"),
+        axes={name: tuple(names) for name, names in json.loads(tree.attrs["axes"]).items()},
+        latent=tuple(json.loads(tree.attrs["latent"])),
+        circular=tuple(json.loads(tree.attrs["circular"])),
+        coords=coords,
+        extra=_group(tree, "extra"),
+        provenance=json.loads(tree.attrs["provenance"]),
+    )
+
+
+def _group(tree: xr.DataTree, name: str) -> dict[str, np.ndarray]:
+    return _arrays(tree[name].to_dataset()) if name in tree.children else {}
+
+
+def _dataset(
+    values: Mapping[str, Any],
+    axes: Mapping[str, tuple[str, ...]],
+    leading: tuple[str, ...],
+    coords: Mapping[str, np.ndarray],
+) -> xr.Dataset:
+    arrays = {name: np.asarray(value) for name, value in values.items()}
+    dims = _dimensions(arrays, axes, leading)
+    variables: dict[str, xr.Variable] = {}
+    for name, array in arrays.items():
+        for key, part in _parts(name, array):
+            attributes = {"complex_of": name} if np.iscomplexobj(array) else {}
+            variables[key] = xr.Variable(dims[name], part, attributes)
+    sizes = {dim: size for v in variables.values() for dim, size in zip(v.dims, v.shape, strict=True)}
+    known = {str(d): np.arange(n) for d, n in sizes.items() if d in leading}
+    known |= {d: np.asarray(c) for d, c in coords.items() if sizes.get(d) == len(c)}
+    return xr.Dataset(variables, coords=known)
+
+
+def _parts(name: str, array: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:
+    if not np.iscomplexobj(array):
+        return [(name, array)]
+    return [(f"{name}.{part}", np.ascontiguousarray(getattr(array, part))) for part in _PARTS]
+
+
+def _dimensions(
+    arrays: Mapping[str, np.ndarray], axes: Mapping[str, tuple[str, ...]], leading: tuple[str, ...]
+) -> dict[str, tuple[str, ...]]:
+    """Names of every variable's dimensions: the axes, made distinct where one name has two sizes.
+
+    The largest size keeps the name; another size n of the axis `a` is called `a.n`, and a second `a` in one
+    variable `a.2`.
+    """
+    wanted: dict[str, tuple[str, ...]] = {}
+    largest: dict[str, int] = {}
+    for name, array in arrays.items():
+        rest = array.ndim - len(leading)
+        given = tuple(axes.get(name, ()))
+        wanted[name] = given if len(given) == rest else tuple(f"{name}_dim_{i}" for i in range(rest))
+        for axis, size in zip(wanted[name], array.shape[len(leading) :], strict=True):
+            largest[axis] = max(size, largest.get(axis, 0))
+    chosen: dict[str, tuple[str, ...]] = {}
+    for name, names in wanted.items():
+        used = list(leading)
+        for axis, size in zip(names, arrays[name].shape[len(leading) :], strict=True):
+            label = axis if size == largest[axis] else f"{axis}.{size}"
+            used.append(label if label not in used else f"{label}.{used.count(label) + 1}")
+        chosen[name] = tuple(used)
+    return chosen
+
+
+def _arrays(dataset: xr.Dataset) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {}
+    for key, variable in dataset.data_vars.items():
+        name = variable.attrs.get("complex_of")
+        if name is None:
+            arrays[str(key)] = variable.values
+        elif name not in arrays:
+            real, imag = (dataset[f"{name}.{part}"].values for part in _PARTS)
+            arrays[name] = real + 1j * imag
+    return arrays

@@ -1,0 +1,27 @@
+"""The error that contract checks raise."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dtprob.errors import InputError
+
+
+class ContractError(InputError):
+    """A model, engine or effect does not keep its contract."""
+
+
+def expect(condition: object, what: str, expected: str, got: object, remedy: str) -> None:
+    """Raise unless the condition holds; the text is that of `InputError`.
+
+    Raises:
+        ContractError: the condition does not hold.
+    """
+    if not bool(condition):
+        raise ContractError(what, expected, str(got), remedy)
+
+
+def same(first: object, second: object) -> bool:
+    """Whether two arrays agree in shape, type and every bit."""
+    a, b = np.asarray(first), np.asarray(second)
+    return a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()

@@ -1,0 +1,54 @@
+"""Engines by name, with errors that name the nearest."""
+
+import jax
+import numpy as np
+import pytest
+
+import dtprob
+from dtprob.errors import InputError
+from dtprob.inference import ENGINES, AbstractEngine, Laplace, Point, resolve
+from tests.unit.inference.examples import normal, normal_data, normal_posterior
+
+KEY = jax.random.key(0)
+
+
+def test_fit_by_name_and_by_engine():
+    data = normal_data()
+    by_name = dtprob.fit(normal, data, engine="laplace", key=KEY, draws=20)
+    by_engine = dtprob.fit(normal, data, engine=Laplace(draws=20), key=KEY)
+    np.testing.assert_array_equal(by_name.draws["level"], by_engine.draws["level"])
+    assert by_name.provenance["engine"] == "laplace"
+    assert by_name.provenance["settings"]["draws"] == 20
+    assert by_name.provenance["key"] == ["threefry2x32", 0, 0]
+    assert len(by_name.provenance["data_sha256"]) == 64
+    assert abs(float(by_name.extra["mode.level"]) - normal_posterior(data)[0]) < 1e-6
+
+
+def test_names_are_those_of_the_table():
+    assert set(ENGINES) == {"nuts", "blackjax_nuts", "von_mises_em", "laplace", "point"}
+    for name in ENGINES:
+        engine = resolve(name)
+        assert isinstance(engine, AbstractEngine)
+        assert engine.name == name
+
+
+def test_settings_replace_those_of_an_engine():
+    assert resolve(Laplace(draws=5), starts=2) == Laplace(draws=5, starts=2)
+    assert resolve("point", objective="maximum_likelihood") == Point(objective="maximum_likelihood")
+
+
+def test_unknown_names_get_the_nearest():
+    with pytest.raises(InputError, match=r"'nutz'.*Did you mean 'nuts'"):
+        resolve("nutz")
+    with pytest.raises(InputError, match=r"settings of engine laplace.*Did you mean 'draws'"):
+        resolve("laplace", draw=3)
+    with pytest.raises(InputError, match="a name or an engine"):
+        resolve(3)
+
+
+def test_data_are_hashed_by_value():
+    first, second, third = (
+        dtprob.fit(normal, normal_data(seed), engine="point", key=KEY).provenance["data_sha256"]
+        for seed in (0, 0, 1)
+    )
+    assert first == second != third

@@ -1,0 +1,238 @@
+"""The run loop: chunks, interruptions and the number of chains never change a draw; angles mix."""
+
+import json
+import signal
+import subprocess
+import sys
+import time
+
+import h5py
+import jax
+import numpy as np
+import pytest
+
+from dtprob.errors import InputError
+from dtprob.inference import NUTS, BlackJAXNUTS, RunOptions, summary
+from dtprob.inference import run as run_module
+from tests.unit.inference.examples import (
+    at_the_cut,
+    at_the_cut_data,
+    logistic,
+    logistic_data,
+    normal,
+    normal_data,
+    normal_posterior,
+)
+
+KEY = jax.random.key(21)
+ENGINES = [NUTS, BlackJAXNUTS]
+SHORT = {"warmup": 60, "draws": 50, "chains": 2}
+
+
+def same(first, second):
+    return all(np.array_equal(first.draws[name], second.draws[name]) for name in first.draws) and all(
+        np.array_equal(first.sample_stats[name], second.sample_stats[name]) for name in first.sample_stats
+    )
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_conjugate_normal(engine):
+    data = normal_data()
+    mean, spread, _ = normal_posterior(data)
+    table = summary(engine(draws=1000, warmup=300)(KEY, normal, data))
+    row = table.loc["level"]
+    assert abs(row["mean"] - mean) < 4 * spread / row["ess"] ** 0.5
+    assert row["sd"] == pytest.approx(spread, rel=0.1)
+    assert row["rhat"] < 1.01
+
+
+@pytest.mark.parametrize(
+    "engine",
+    [
+        NUTS,
+        pytest.param(
+            BlackJAXNUTS,
+            marks=pytest.mark.xfail(reason="its compiled step rounds otherwise in other chunks", strict=False),
+        ),
+    ],
+)
+def test_chunks_chains_and_draws_do_not_change_a_draw(engine):
+    data = logistic_data()
+    whole = engine(**SHORT)(KEY, logistic, data)
+    for chunk in (7, 60):
+        assert same(whole, engine(**SHORT)(KEY, logistic, data, options=RunOptions(chunk=chunk)))
+    one = engine(warmup=60, draws=50, chains=1)(KEY, logistic, data)
+    np.testing.assert_array_equal(one.draws["weight"][0], whole.draws["weight"][0])
+    longer = engine(warmup=60, draws=70, chains=2)(KEY, logistic, data)
+    np.testing.assert_array_equal(longer.draws["weight"][:, :50], whole.draws["weight"])
+
+
+def test_side_by_side_is_the_same_up_to_rounding_at_first():
+    data = normal_data()
+    apart = NUTS(warmup=0, draws=5, chains=3)(KEY, normal, data)
+    together = NUTS(warmup=0, draws=5, chains=3, chain_method="vectorized")(KEY, normal, data)
+    np.testing.assert_allclose(together.draws["level"], apart.draws["level"], rtol=1e-6)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_an_angle_at_the_cut_mixes(engine):
+    data = at_the_cut_data()
+    posterior = engine(draws=700, warmup=500)(KEY, at_the_cut, data)
+    table = summary(posterior)
+    assert table["rhat"].max() < 1.02
+    assert table["ess"].min() > 300
+    eta = 3.0 * np.exp(1j * data["y"]).sum() + 0.05
+    error = np.angle(np.exp(1j * (table.loc["angle", "mean"] - np.angle(eta))))
+    assert abs(error) < 4 * np.abs(eta) ** -0.5 / table.loc["angle", "ess"] ** 0.5
+    assert table.loc["angle", "resultant_length"] == pytest.approx(1 - 0.5 / np.abs(eta), abs=0.01)
+    assert table.loc["angle", "low"] > table.loc["angle", "high"]  # the interval crosses the cut
+    assert table.loc["free", "resultant_length"] < 0.1
+    assert not posterior.sample_stats["diverging"].any()
+    assert posterior.sample_stats["tree_depth"].max() <= 6  # flat directions do not run on for ever
+
+
+class StoppedError(Exception):
+    pass
+
+
+def stop_after(monkeypatch, chunks):
+    """Let the run fail once so many checkpoints are written."""
+    write = run_module.checkpoint.write
+    written = []
+
+    def writing(*arguments):
+        write(*arguments)
+        written.append(1)
+        if len(written) == chunks:
+            raise StoppedError
+
+    monkeypatch.setattr(run_module.checkpoint, "write", writing)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("chunks", [1, 2, 5])
+def test_an_interrupted_run_continues_as_if_nothing_had_happened(engine, chunks, tmp_path, monkeypatch):
+    data = at_the_cut_data()
+    whole = engine(**SHORT)(KEY, at_the_cut, data)
+    options = RunOptions(checkpoint=tmp_path / "run.h5", chunk=20, resume=True)
+    with monkeypatch.context() as patch:
+        stop_after(patch, chunks)
+        with pytest.raises(StoppedError):
+            engine(**SHORT)(KEY, at_the_cut, data, options=options)
+    assert same(whole, engine(**SHORT)(KEY, at_the_cut, data, options=options))
+    assert same(whole, engine(**SHORT)(KEY, at_the_cut, data, options=options))  # nothing left to do
+
+
+KILLED = """
+import sys
+import jax
+jax.config.update("jax_enable_x64", True)
+from pathlib import Path
+from dtprob.inference import NUTS, RunOptions
+sys.path.insert(0, "tests/unit/inference")
+from examples import normal, normal_data
+options = RunOptions(checkpoint=Path(sys.argv[1]), chunk=200, resume=True)
+posterior = NUTS(warmup=100, draws=int(sys.argv[2]), chains=1)(
+    jax.random.key(21), normal, normal_data(), options=options
+)
+posterior.save(sys.argv[3])
+"""
+
+
+def test_killed_without_warning_then_resumed(tmp_path):
+    from dtprob.inference import Posterior
+
+    draws = 30_000
+    path, result = tmp_path / "run.h5", tmp_path / "posterior.nc"
+    command = [sys.executable, "-c", KILLED, str(path), str(draws), str(result)]
+    process = subprocess.Popen(command)
+    while not path.exists() and process.poll() is None:
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    assert not result.exists()
+    with h5py.File(path) as file:
+        assert 0 < file.attrs["done"] < draws + 100
+    subprocess.run(command, check=True)
+    whole = NUTS(warmup=100, draws=draws, chains=1)(KEY, normal, normal_data())
+    assert same(whole, Posterior.load(result))
+
+
+def test_a_checkpoint_of_another_run_is_refused(tmp_path):
+    options = RunOptions(checkpoint=tmp_path / "run.h5", chunk=50, resume=True)
+    NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
+    attempts = {
+        "data_sha256": lambda: NUTS(**SHORT)(KEY, normal, normal_data(1), options=options),
+        "key": lambda: NUTS(**SHORT)(jax.random.key(1), normal, normal_data(), options=options),
+        "settings": lambda: NUTS(warmup=61, draws=50, chains=2)(KEY, normal, normal_data(), options=options),
+        "engine": lambda: BlackJAXNUTS(**SHORT)(KEY, normal, normal_data(), options=options),
+        "at most 70 steps": lambda: NUTS(warmup=60, draws=10, chains=2)(
+            KEY, normal, normal_data(), options=options
+        ),
+    }
+    for reason, attempt in attempts.items():
+        with pytest.raises(InputError, match=reason):
+            attempt()
+
+
+def test_a_checkpoint_of_another_version_or_model_is_refused(tmp_path, monkeypatch):
+    import numpyro
+    import numpyro.distributions as dist
+
+    path = tmp_path / "run.h5"
+    options = RunOptions(checkpoint=path, chunk=50, resume=True)
+    NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
+
+    def other(noise, y=None):
+        level = numpyro.sample("level", dist.Normal(1.0, 2.0))
+        with numpyro.plate("row", 12):
+            numpyro.sample("y", dist.Normal(level, noise), obs=y)
+
+    other.__name__ = "normal"
+    with pytest.raises(InputError, match="expected density"):
+        NUTS(**SHORT)(KEY, other, normal_data(), options=options)
+    monkeypatch.setattr("dtprob.__version__", "99.0")
+    with pytest.raises(InputError, match=r"expected dtprob '99\.0', got '0\.1\.0'"):
+        NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
+    path.write_text("no checkpoint")
+    with pytest.raises(InputError, match="expected an HDF5 file"):
+        NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
+
+
+def test_without_resume_an_old_checkpoint_is_replaced(tmp_path):
+    path = tmp_path / "run.h5"
+    NUTS(**SHORT)(KEY, normal, normal_data(), options=RunOptions(checkpoint=path))
+    NUTS(**SHORT)(KEY, normal, normal_data(1), options=RunOptions(checkpoint=path))
+    again = RunOptions(checkpoint=path, resume=True)
+    NUTS(**SHORT)(KEY, normal, normal_data(1), options=again)
+
+
+def test_progress_is_plain_lines_and_a_status_file(tmp_path, capfd):
+    options = RunOptions(progress=True, status_file=tmp_path / "status.json", chunk=30)
+    NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
+    lines = capfd.readouterr().err.strip().splitlines()
+    assert lines[0].startswith("nuts: warmup 30/110")
+    assert lines[-1].startswith("nuts: draws 110/110")
+    status = json.loads((tmp_path / "status.json").read_text())
+    assert (status["done"], status["total"], status["phase"]) == (110, 110, "draws")
+
+
+def test_silent_by_default(capfd):
+    NUTS(**SHORT)(KEY, normal, normal_data())
+    assert capfd.readouterr() == ("", "")
+
+
+def test_large_sites_are_left_out_and_named():
+    data = normal_data()
+    posterior = NUTS(**SHORT)(KEY, normal, data, options=RunOptions(max_entries=1000))
+    assert "y" not in posterior.log_likelihood
+    assert posterior.provenance["left_out"] == ["y"]
+
+
+def test_settings_are_checked():
+    with pytest.raises(InputError, match="chains of engine nuts: expected 1 or more, got 0"):
+        NUTS(chains=0)(KEY, normal, normal_data())
+    with pytest.raises(InputError, match="resume"):
+        RunOptions(resume=True)
+    with pytest.raises(InputError, match="one typed JAX key"):
+        NUTS()(jax.random.PRNGKey(0), normal, normal_data())

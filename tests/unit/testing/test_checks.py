@@ -1,0 +1,153 @@
+"""The contract checks accept what keeps the contract and name what breaks it."""
+
+import dataclasses
+from typing import ClassVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.inference import AbstractEngine, Laplace
+from dtprob.models.declaration import model
+from dtprob.testing import ContractError, check_effect, check_engine, check_model
+
+X = np.linspace(0.5, 2.0, 8)
+DATA = {"x": X, "y": 1.5 * X}
+
+
+def line(x, y=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    with numpyro.plate("row", x.shape[0]):
+        mean = numpyro.deterministic("mean", slope * x)
+        numpyro.sample("y", dist.Normal(mean, 0.5), obs=y)
+
+
+line = model(axes={"mean": ("row",)})(line)
+
+
+def test_a_good_model():
+    check_model(line, DATA)
+
+
+def unnamed(x, y=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    numpyro.sample("y", dist.Normal(slope * x, 0.5).to_event(1), obs=y)
+
+
+def sized_by_its_data(x, y=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    with numpyro.plate("row", 3 if y is None else x.shape[0]):
+        numpyro.sample("y", dist.Normal(slope, 0.5), obs=y)
+
+
+def stops_the_gradient(x, y=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    with numpyro.plate("row", x.shape[0]):
+        numpyro.sample("y", dist.Normal(jax.lax.stop_gradient(slope) * x, 0.5), obs=y)
+
+
+def fails_for_some(x, y=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    with numpyro.plate("row", x.shape[0]):
+        numpyro.sample("y", dist.Normal(jnp.sqrt(slope) * x, 0.5), obs=y)
+
+
+@pytest.mark.parametrize(
+    ("broken", "message"),
+    [
+        (unnamed, "a name for every axis of 'y'"),
+        (sized_by_its_data, r"prior draw of 'y': expected shape \(8,\), got \(3,\)"),
+        (stops_the_gradient, "the gradient of the log density"),
+        (fails_for_some, "expected finite|a finite log density"),
+    ],
+)
+def test_broken_models(broken, message):
+    with pytest.raises(ContractError, match=message):
+        check_model(broken, DATA)
+
+
+@dataclasses.dataclass(frozen=True)
+class Shifted(AbstractEngine):
+    """An engine that is wrong by a little, or lays its draws out wrongly."""
+
+    name: ClassVar[str] = "shifted"
+    answer: ClassVar[str] = "approximation"
+
+    shift: float = 0.0
+    ignore_key: bool = False
+
+    def __call__(self, key, model, data, **options):
+        used = jax.random.key(0) if self.ignore_key and isinstance(key, jax.Array) else key
+        posterior = Laplace(draws=2000)(used, model, data, **options)
+        draws = {
+            "level": posterior.draws["level"] + self.shift,
+            "doubled": posterior.draws["doubled"] + 2 * self.shift,
+        }
+        return dataclasses.replace(posterior, draws=draws)
+
+
+def test_engines():
+    check_engine(Shifted())
+    with pytest.raises(ContractError, match="the posterior of the closed form"):
+        check_engine(Shifted(shift=0.2))
+    with pytest.raises(ContractError, match="other draws for another key"):
+        check_engine(Shifted(ignore_key=True))
+
+
+def offset(**changes):
+    settings = {
+        "family": "offset",
+        "rewrites": {"mean": lambda value, given, context: value + given["size"]},
+        "parameters": (Parameter("size", dist.Normal(0.0, 1.0), unit="V"),),
+        "physics": "a constant voltage added to the output",
+        "source": "any textbook",
+    }
+    return Effect(**{**settings, **changes})
+
+
+def rough(value, given, context):
+    return value + jnp.abs(given["size"])
+
+
+def noisy(value, given, context):
+    return value * given["size"] * given["field"] + value
+
+
+GOOD = {
+    "mean": offset(),
+    "variance": offset(
+        kind="variance",
+        rewrites={"mean": noisy},
+        parameters=(Parameter("size", dist.HalfNormal(1.0), unit="1"),),
+    ),
+    "distribution": offset(
+        rewrites={},
+        distributions={"y": lambda fn, given, context: dist.Normal(fn.loc + given["size"], fn.scale)},
+    ),
+}
+
+
+@pytest.mark.parametrize("name", GOOD)
+def test_good_effects(name):
+    check_effect(GOOD[name], line, DATA)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"physics": ""}, "a text for 'physics'"),
+        ({"parameters": (Parameter("size", dist.Normal(0.0, 1.0), unit=""),)}, "a unit"),
+        ({"parameters": (Parameter("size", dist.Uniform(1.0, 2.0), unit="V"),)}, "around the null 0"),
+        ({"rewrites": {"slope of nothing": rough}}, "a site 'slope of nothing'"),
+        ({"rewrites": {"mean": lambda v, g, c: v + g["size"] + 1e-9}}, "'mean' unchanged at the null"),
+        ({"rewrites": {"mean": rough}}, "the derivative of finite differences"),
+        ({"rewrites": {"mean": lambda v, g, c: v + jnp.sqrt(g["size"])}}, "finite"),
+    ],
+)
+def test_broken_effects(changes, message):
+    with pytest.raises(ContractError, match=message):
+        check_effect(offset(**changes), line, DATA)
