@@ -1,0 +1,225 @@
+"""The propagation paths of a traced scene, as one frozen pytree that needs no ray tracer."""
+
+from typing import Any, Final
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
+
+from dtprob.errors import InputError
+
+NONE: Final = 0
+SPECULAR: Final = 1
+DIFFUSE: Final = 2
+REFRACTION: Final = 4
+DIFFRACTION: Final = 8
+INTERACTIONS: Final = {
+    NONE: "none",
+    SPECULAR: "specular reflection",
+    DIFFUSE: "diffuse reflection",
+    REFRACTION: "refraction",
+    DIFFRACTION: "diffraction",
+}
+
+
+class PathSet(eqx.Module):
+    """The paths of several links, padded to a common number and depth; `mask` tells which exist.
+
+    Where a path or an interaction is missing, every array holds a harmless finite value, never NaN or -1.
+    The channel they make is h(f_k) = sum_p a_p exp(-j 2 pi (f_c + f_k) tau_p).
+
+    Attributes:
+        delay: tau_p in s, computed in double precision from the geometry.
+        carrier_phasor: exp(-j 2 pi f_c tau_p), computed in double precision; use it for the phase of the
+            carrier, because f_c tau_p in single precision keeps no phase.
+        departure: unit vector of travel on leaving the transmitter.
+        arrival: unit vector of travel at the receiver, pointing towards it.
+        mask: which paths exist.
+        interaction: what happens at each step: 0 none, 1 specular reflection, 2 diffuse reflection,
+            4 refraction, 8 diffraction (the codes of Sionna RT).
+        object: index into `object_names`; 0 where `interaction` is 0.
+        vertex: point of each interaction, in m.
+        normal: unit normal of the surface there, of either sign.
+        length: unfolded length of the path in m.
+        tx_field: field vector of the transmitting element in the direction of departure, in world axes.
+        rx_field: field vector of the receiving element towards the arriving wave, in world axes.
+        rx_position: of each link, in m.
+        tx_position: of each link, in m.
+        object_material: index into `material_names`, per object.
+        permittivity: relative permittivity of each object as the scene has it.
+        conductivity: in S/m, as the scene has it.
+        thickness: of the slab that each object is, in m, as the scene has it.
+        frequency: carrier f_c in Hz.
+        object_names: names of the objects of the scene.
+        material_names: names of its materials.
+        scattering: scattering coefficient S per object, or None when all are 0; a specular reflection is
+            weakened by sqrt(1 - S^2).
+        provenance: pairs of name and value that say where the paths come from (scene, solver, settings).
+    """
+
+    delay: Float[Array, "link path"]
+    carrier_phasor: Complex[Array, "link path"]
+    departure: Float[Array, "link path 3"]
+    arrival: Float[Array, "link path 3"]
+    mask: Bool[Array, "link path"]
+    interaction: Int[Array, "link path depth"]
+    object: Int[Array, "link path depth"]
+    vertex: Float[Array, "link path depth 3"]
+    normal: Float[Array, "link path depth 3"]
+    length: Float[Array, "link path"]
+    tx_field: Shaped[Array, "link path 3"]
+    rx_field: Shaped[Array, "link path 3"]
+    rx_position: Float[Array, "link 3"]
+    tx_position: Float[Array, "link 3"]
+    object_material: Int[Array, " object"]
+    permittivity: Float[Array, " object"]
+    conductivity: Float[Array, " object"]
+    thickness: Float[Array, " object"]
+    frequency: float = eqx.field(static=True)
+    object_names: tuple[str, ...] = eqx.field(static=True)
+    material_names: tuple[str, ...] = eqx.field(static=True)
+    scattering: Float[Array, " object"] | None = None
+    provenance: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
+
+    @property
+    def n_link(self) -> int:
+        """Number of links."""
+        return self.delay.shape[0]
+
+    @property
+    def n_path(self) -> int:
+        """Number of paths per link, missing ones included."""
+        return self.delay.shape[1]
+
+    @property
+    def depth(self) -> int:
+        """Largest number of interactions on a path."""
+        return self.interaction.shape[2]
+
+    @property
+    def n_object(self) -> int:
+        """Number of objects in the scene."""
+        return self.object_material.shape[0]
+
+    @property
+    def n_material(self) -> int:
+        """Number of materials in the scene."""
+        return len(self.material_names)
+
+    @property
+    def wavelength(self) -> float:
+        """Wavelength of the carrier in m."""
+        return 299_792_458.0 / self.frequency
+
+    def take(self, links: Int[Any, " chosen"]) -> "PathSet":
+        """The path set of some links, in the order given; objects and materials stay.
+
+        Args:
+            links: indices of links, or a boolean mask over them.
+
+        Raises:
+            InputError: an index names no link.
+        """
+        index = np.asarray(links)
+        if index.dtype == bool:
+            index = np.flatnonzero(index)
+        if index.ndim != 1 or np.any((index < 0) | (index >= self.n_link)):
+            got = np.array2string(index, threshold=8)
+            raise InputError(
+                "links to take", f"indices from 0 to {self.n_link - 1}", got, "Name links that exist"
+            )
+        chosen = {
+            name: jnp.asarray(getattr(self, name))[index]
+            for name, dims in DIMENSIONS.items()
+            if dims[0] == "link"
+        }
+        return eqx.tree_at(
+            lambda paths: [getattr(paths, name) for name in chosen], self, list(chosen.values())
+        )
+
+
+DIMENSIONS: Final[dict[str, tuple[str, ...]]] = {
+    "delay": ("link", "path"),
+    "carrier_phasor": ("link", "path"),
+    "departure": ("link", "path", "xyz"),
+    "arrival": ("link", "path", "xyz"),
+    "mask": ("link", "path"),
+    "interaction": ("link", "path", "depth"),
+    "object": ("link", "path", "depth"),
+    "vertex": ("link", "path", "depth", "xyz"),
+    "normal": ("link", "path", "depth", "xyz"),
+    "length": ("link", "path"),
+    "tx_field": ("link", "path", "xyz"),
+    "rx_field": ("link", "path", "xyz"),
+    "rx_position": ("link", "xyz"),
+    "tx_position": ("link", "xyz"),
+    "object_material": ("object",),
+    "permittivity": ("object",),
+    "conductivity": ("object",),
+    "thickness": ("object",),
+    "scattering": ("object",),
+}
+"""The axes of every array of a `PathSet`."""
+
+_REMEDY: Final = "Trace the scene again, or correct the array"
+
+
+def validate(paths: PathSet) -> PathSet:
+    """Check that a path set is whole, and give it back.
+
+    Args:
+        paths: a path set with concrete arrays.
+
+    Raises:
+        InputError: an array has another shape, holds NaN or infinity, an index out of range, an unknown
+            code of interaction, or a direction that is not of unit length.
+    """
+    _check_shapes(paths)
+    for name in DIMENSIONS:
+        value = getattr(paths, name)
+        if value is not None and not np.all(np.isfinite(np.asarray(value))):
+            raise InputError(
+                f"paths.{name}", "finite values (missing paths through the mask)", "NaN or inf", _REMEDY
+            )
+    codes = set(np.unique(np.asarray(paths.interaction)).tolist())
+    if not codes <= set(INTERACTIONS):
+        expected = ", ".join(f"{code} ({name})" for code, name in INTERACTIONS.items())
+        raise InputError("paths.interaction", expected, str(sorted(codes - set(INTERACTIONS))), _REMEDY)
+    _check_range("object", paths.object, paths.n_object)
+    _check_range("object_material", paths.object_material, paths.n_material)
+    if not paths.frequency > 0:
+        raise InputError("paths.frequency", "a positive carrier in Hz", repr(paths.frequency), _REMEDY)
+    _check_physics(paths)
+    return paths
+
+
+def _check_shapes(paths: PathSet) -> None:
+    size = {"link": paths.n_link, "path": paths.n_path, "depth": paths.depth, "xyz": 3}
+    size["object"] = len(paths.object_names)
+    for name, dims in DIMENSIONS.items():
+        value = getattr(paths, name)
+        expected = tuple(size[dim] for dim in dims)
+        if value is not None and np.shape(value) != expected:
+            named = ", ".join(dims)
+            raise InputError(f"paths.{name}", f"shape ({named}) = {expected}", str(np.shape(value)), _REMEDY)
+
+
+def _check_range(name: str, value: Array, count: int) -> None:
+    index = np.asarray(value)
+    if index.size and (index.min() < 0 or index.max() >= count):
+        got = f"{index.min()} to {index.max()}"
+        raise InputError(f"paths.{name}", f"indices from 0 to {count - 1}", got, _REMEDY)
+
+
+def _check_physics(paths: PathSet) -> None:
+    mask = np.asarray(paths.mask)
+    for name in ("departure", "arrival"):
+        norm = np.linalg.norm(np.asarray(getattr(paths, name)), axis=-1)[mask]
+        if norm.size and np.max(np.abs(norm - 1)) > 1e-4:
+            got = f"lengths from {norm.min():.6g} to {norm.max():.6g}"
+            raise InputError(f"paths.{name}", "unit vectors", got, _REMEDY)
+    for name in ("delay", "length"):
+        value = np.asarray(getattr(paths, name))[mask]
+        if value.size and value.min() <= 0:
+            raise InputError(f"paths.{name}", "positive values", f"{value.min():.6g}", _REMEDY)
