@@ -1,0 +1,283 @@
+"""Antenna arrays: elements that differ, couple, stand elsewhere or are turned.
+
+A receiving element at r answers a wave travelling along k with exp(-j 2 pi / lambda r.k), a transmitting one
+with the opposite sign. "rx" and "tx" in an instance's name say which end is meant; "rx_3" is one element.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dtprob.effects.common import (
+    CHANNEL_AXES,
+    SIDES,
+    Data,
+    Family,
+    Sites,
+    along,
+    array_of,
+    band,
+    complex_of,
+    each_antenna,
+    half_normal,
+    has_phase,
+    n_antenna,
+    normal,
+    observable_basis,
+    offers,
+    on_axis,
+    phasor,
+)
+from dtprob.effects.effect import FIELD, Effect, Parameter
+
+_SIGN: Final = {"rx": -1.0, "tx": 1.0}
+_DIRECTION: Final = {"rx": "arrival", "tx": "departure"}
+_NEIGHBOUR: Final = 1.05
+"""Elements count as neighbours up to this multiple of the smallest distance."""
+
+
+def array_calibration(sites: Sites, _data: Data) -> list[Effect]:
+    """Complex gains of the chains behind the elements: all against the first, or one element alone."""
+    effects = []
+    for side, count in _ends(sites):
+
+        def weigh_all(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+            first = jnp.zeros(1)
+            return value * _gain(
+                jnp.concatenate([first, p["log_gain"]]), jnp.concatenate([first, p["phase"]])
+            )
+
+        whole = Effect(
+            "array_calibration",
+            {f"{side}_response": weigh_all},
+            (normal("log_gain", 0.2, "Np", count - 1), normal("phase", 0.5, "rad", count - 1)),
+            instance=side,
+            physics=f"Unknown complex gains of the {side} elements, the first one being the reference.",
+            source="diag(exp(g + j phi)) on the array response.",
+        )
+        effects.append(whole)
+        for index, name in each_antenna(count, side):
+
+            def weigh(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], index: int = index) -> Any:
+                own = jnp.arange(value.shape[-1]) == index
+                return jnp.where(own, value * _gain(p["log_gain"], p["phase"]), value)
+
+            effects.append(
+                Effect(
+                    "array_calibration",
+                    {f"{side}_response": weigh},
+                    (normal("log_gain", 0.2, "Np"), normal("phase", 0.5, "rad")),
+                    instance=name,
+                    physics=f"Complex gain of {side} element {index} differs from that of the others.",
+                    source="exp(g + j phi) on one element's response.",
+                )
+            )
+    return effects
+
+
+def cable_delay(sites: Sites, data: Data) -> list[Effect]:
+    """The cable of one element is longer; the carrier's phase counts as calibrated."""
+    measured = band(data)
+    if measured is None:
+        return []
+    effects = []
+    for side, count in _ends(sites):
+        for index, name in each_antenna(count, side) or [(1, f"{side}_1")]:
+            axis = f"{side}_antenna"
+
+            def delay(
+                value: Any,
+                p: Mapping[str, Any],
+                context: Mapping[str, Any],
+                index: int = index,
+                axis: str = axis,
+            ) -> Any:
+                place = CHANNEL_AXES.index(axis)
+                own = on_axis(jnp.arange(value.shape[place]) == index, axis, CHANNEL_AXES)
+                turn = phasor(-2 * jnp.pi * jnp.asarray(context["subcarrier_frequency"]) * p["delay"])
+                return jnp.where(own, value * turn, value)
+
+            effects.append(
+                Effect(
+                    "cable_delay",
+                    {"noiseless_channel": delay},
+                    (normal("delay", 0.25 / measured.width, "s"),),
+                    instance=name,
+                    physics=f"Baseband delay of {side} element {index} alone.",
+                    source="exp(-j 2 pi f_k d) on one element.",
+                    requires=("subcarrier_frequency",),
+                )
+            )
+    return effects
+
+
+def mutual_coupling(sites: Sites, data: Data) -> list[Effect]:
+    """Every element picks up a share of what its nearest neighbours see."""
+    effects = []
+    for side, _ in _ends(sites):
+        array = array_of(data, side)
+        if array is None:
+            continue
+        distance = np.linalg.norm(array[:, None] - array[None], axis=-1)
+        nearest = distance[~np.eye(len(array), dtype=bool)].min()
+        neighbours = np.where((distance > 0) & (distance <= _NEIGHBOUR * nearest), 1.0, 0.0)
+
+        def couple(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], matrix: Any = neighbours) -> Any:
+            return value + complex_of(p["coupling"]) * jnp.einsum("...a,ba->...b", value, jnp.asarray(matrix))
+
+        effects.append(
+            Effect(
+                "mutual_coupling",
+                {f"{side}_response": couple},
+                (normal("coupling", 0.1, "1", 2),),
+                instance=side,
+                physics=f"One complex coupling between neighbouring {side} elements (real, imaginary).",
+                source="(I + c A) a, A the neighbours: first order of Gupta and Ksienski,"
+                " IEEE Trans. Antennas Propag. 31 (1983).",
+            )
+        )
+    return effects
+
+
+def element_spacing(sites: Sites, data: Data) -> list[Effect]:
+    """The aperture is larger or smaller than recorded."""
+    return [
+        _phase_effect(
+            "element_spacing",
+            side,
+            normal("scale", 0.02),
+            lambda p, k, r, _: p["scale"] * jnp.einsum("...x,ax->...a", k, r),
+            physics=f"All distances between {side} elements are off by one relative amount.",
+            source="exp(-+j 2 pi / lambda (1 + s) r.k).",
+        )
+        for side in _arrays(sites, data)
+    ]
+
+
+def antenna_orientation(sites: Sites, data: Data) -> list[Effect]:
+    """The array is turned; its elements' patterns and polarisation are taken to stay."""
+    effects = []
+    for side, array in _arrays(sites, data).items():
+        levers = np.cross(array[:, None], np.eye(3)[None]).reshape(-1, 3)
+        basis = observable_basis(levers)
+        effects.append(
+            _phase_effect(
+                "antenna_orientation",
+                side,
+                normal("rotation", 0.05, "rad", len(basis)),
+                lambda p, k, r, _, basis=basis: jnp.einsum(
+                    "...x,ax->...a", k, _turned(r, p["rotation"] @ jnp.asarray(basis))
+                ),
+                physics=f"The {side} array is turned about its centre, around {along(basis)}.",
+                source="r' = R r, R by Rodrigues from the vector 2 tan(angle / 2) times the axis.",
+            )
+        )
+    return effects
+
+
+def near_field(sites: Sites, data: Data) -> list[Effect]:
+    """Wave fronts are spheres, not planes."""
+
+    def curvature(p: Mapping[str, Any], k: Any, r: Any, context: Mapping[str, Any]) -> Any:
+        paths, along_wave = context["paths"], jnp.einsum("...x,ax->...a", k, r)
+        length = jnp.where(paths.mask, paths.length, 1.0)[..., None]
+        return p["share"] * (jnp.sum(r**2, -1) - along_wave**2) / (2 * length)
+
+    return [
+        _phase_effect(
+            "near_field",
+            side,
+            normal("share", 1.0),
+            curvature if side == "rx" else lambda p, k, r, context: -curvature(p, k, r, context),
+            physics=f"Quadratic phase over the {side} array; share 1 is the sphere of the unfolded length.",
+            source="Fresnel: |L k + r| = L + r.k + (|r|^2 - (r.k)^2) / (2 L).",
+        )
+        for side in _arrays(sites, data)
+    ]
+
+
+def angular_spread(sites: Sites, data: Data) -> list[Effect]:
+    """Each path comes from (goes to) a direction that differs at random from the traced one."""
+    effects = []
+    for side in _arrays(sites, data):
+        if not offers(sites, _DIRECTION[side]):
+            continue
+
+        def spread(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+            radial = jnp.sum(p[FIELD] * value, -1, keepdims=True)
+            return value + p["scale"] * (p[FIELD] - radial * value)
+
+        effects.append(
+            Effect(
+                "angular_spread",
+                {_DIRECTION[side]: spread},
+                (half_normal("scale", 0.03, "rad"),),
+                instance=side,
+                kind="variance",
+                physics=f"Random direction of every path at the {side} end, as rough scenes give.",
+                source="k' = k + s (z - (z.k) k), to first order a rotation.",
+            )
+        )
+    return effects
+
+
+def _ends(sites: Sites) -> list[tuple[str, int]]:
+    """The ends with several antennas in a model with phases, and their number of antennas."""
+    if not has_phase(sites):
+        return []
+    return [(side, n_antenna(sites, side)) for side in SIDES if n_antenna(sites, side) > 1]
+
+
+def _arrays(sites: Sites, data: Data) -> dict[str, np.ndarray]:
+    """Element positions at the ends with several antennas, where they and the directions are known."""
+    found = {side: array_of(data, side) for side, _ in _ends(sites) if offers(sites, _DIRECTION[side])}
+    return {side: array for side, array in found.items() if array is not None and "paths" in data}
+
+
+def _gain(log_gain: Float[Array, "*n"], phase: Float[Array, "*n"]) -> jax.Array:
+    return jnp.exp(log_gain) * phasor(phase)
+
+
+def _phase_effect(
+    family: str, side: str, parameter: Parameter, advance: Any, *, physics: str, source: str
+) -> Effect:
+    """An effect that adds advance(p, k, r, context), in m along the wave, to the phase of every element."""
+
+    def turn(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        paths, positions = context["paths"], jnp.asarray(context[f"{side}_array"])
+        metres = advance(p, context[_DIRECTION[side]], positions, context)
+        return value * phasor(_SIGN[side] * 2 * jnp.pi / paths.wavelength * metres)
+
+    return Effect(
+        family,
+        {f"{side}_response": turn},
+        (parameter,),
+        instance=side,
+        physics=physics,
+        source=source,
+        requires=("paths", f"{side}_array", _DIRECTION[side]),
+    )
+
+
+def _turned(positions: Float[Array, "antenna 3"], rotation: Float[Array, " 3"]) -> Float[Array, "antenna 3"]:
+    """R r - r for the rotation whose Rodrigues vector is rotation / 2; exactly 0 for no rotation."""
+    half = jnp.broadcast_to(rotation / 2, positions.shape)
+    first = jnp.cross(half, positions)
+    return 2 * (first + jnp.cross(half, first)) / (1.0 + jnp.sum(half**2, -1, keepdims=True))
+
+
+FAMILIES: Final[dict[str, Family]] = {
+    "array_calibration": array_calibration,
+    "cable_delay": cable_delay,
+    "mutual_coupling": mutual_coupling,
+    "element_spacing": element_spacing,
+    "antenna_orientation": antenna_orientation,
+    "near_field": near_field,
+    "angular_spread": angular_spread,
+}

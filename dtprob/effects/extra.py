@@ -1,0 +1,216 @@
+"""Paths that reality has and the twin lacks: around edges, off small scatterers, and the diffuse rest.
+
+They are added to the noiseless channel, so they get what a model lets all paths share: the sites
+`frequency_response`, `path_phase` (that of the first path), and `receiver_gain` and `receiver_delay` where a
+model has them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Complex, Float
+from scipy.constants import speed_of_light
+
+from dtprob.effects.common import (
+    Data,
+    Family,
+    Sites,
+    band,
+    complex_of,
+    half_normal,
+    has_phase,
+    meets,
+    normal,
+    offers,
+    phasor,
+    touched_objects,
+)
+from dtprob.effects.effect import FIELD, Effect
+from dtprob.raytracing.field import steering
+from dtprob.raytracing.paths import NONE, PathSet
+
+_NEEDS: Final = ("paths", "subcarrier_frequency", "path_phase", "frequency_response")
+_TAPS: Final = 16
+"""Taps of the diffuse tail at most."""
+
+
+def extra_path(sites: Sites, data: Data) -> list[Effect]:
+    """An object also scatters as a point: a path over the centre of its reflections to every link."""
+    if not _sums_paths(sites) or data.get("paths") is None:
+        return []
+    effects = []
+    for index, name in touched_objects(data):
+        paths: PathSet = data["paths"]
+        centre = np.asarray(paths.vertex)[np.asarray(meets(paths, index))].mean(axis=0)
+
+        def scatter(
+            value: Any, p: Mapping[str, Any], context: Mapping[str, Any], centre: Any = centre
+        ) -> Any:
+            paths = context["paths"]
+            first, second = _leg(paths.tx_position, centre), _leg(centre, paths.rx_position)
+            loss = paths.wavelength / ((4 * jnp.pi) ** 1.5 * first[1] * second[1])
+            path = _path(context, first[0], second[0], first[1] + second[1])
+            return value + complex_of(p["scattering"]) * loss[:, None, None, None, None] * path
+
+        effects.append(
+            Effect(
+                "extra_path",
+                {"noiseless_channel": scatter},
+                (normal("scattering", 1.0, "m", 2),),
+                instance=name,
+                physics=f"A point at {_text(centre)} on {name} scatters to all links; the size is the complex"
+                " square root of its radar cross section (real, imaginary).",
+                source="Bistatic radar equation: lambda sqrt(sigma) / ((4 pi)^(3/2) r1 r2).",
+                requires=_NEEDS,
+            )
+        )
+    return effects
+
+
+def diffraction(sites: Sites, data: Data) -> list[Effect]:
+    """Links that the twin calls obstructed get a wave bent around the obstacle."""
+    paths: PathSet | None = data.get("paths")
+    if paths is None or not _sums_paths(sites) or not np.any(np.asarray(_obstructed(paths))):
+        return []
+
+    def bend(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        paths = context["paths"]
+        direction, length = _leg(paths.tx_position, paths.rx_position)
+        loss = jnp.where(_obstructed(paths), paths.wavelength / (4 * jnp.pi * length), 0.0)
+        path = _path(context, direction, direction, length)
+        return value + p["scale"] * loss[:, None, None, None, None] * complex_of(p[FIELD]) * path
+
+    return [
+        Effect(
+            "diffraction",
+            {"noiseless_channel": bend},
+            (half_normal("scale", 0.2),),
+            kind="variance",
+            physics="A path near the obstructed line of sight, with a random complex gain per link relative"
+            " to free space: the edge that bends it is not in the path set.",
+            source="Shadow region of a knife edge, ITU-R P.526, sec. 4.1.",
+            requires=_NEEDS,
+            field_shape=lambda value, _: (value.shape[0], 1, 1, 1, 1, 2),
+        )
+    ]
+
+
+def diffuse_scattering(sites: Sites, data: Data) -> list[Effect]:
+    """A dense tail behind the first path, of many weak waves without direction."""
+    paths: PathSet | None = data.get("paths")
+    if paths is None or not _sums_paths(sites):
+        return []
+    measured = band(data)
+    taps = 1 if measured is None else min(_TAPS, measured.size)
+    step = 0.0 if measured is None else 1.0 / measured.width
+    decay = max(_delay_spread(paths), step, 1e-12)
+    weight = np.exp(-step * np.arange(taps) / (2 * decay))
+    weight = weight / np.linalg.norm(weight)
+
+    def fill(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        paths = context["paths"]
+        first = jnp.min(jnp.where(paths.mask, paths.delay, jnp.inf), axis=1)
+        first = jnp.where(jnp.isfinite(first), first, 0.0)
+        delay = first[:, None] + step * jnp.arange(taps)
+        tone = phasor(-2 * jnp.pi * delay[..., None] * jnp.asarray(context["subcarrier_frequency"]))
+        waves = complex_of(p[FIELD])[:, :, :, :, 0] * jnp.asarray(weight)
+        loss = jnp.sqrt(jnp.sum(_free_space(paths) ** 2, axis=1))[:, None, None, None, None]
+        tail = jnp.einsum("lsrtm,lmk->lsrtk", waves, tone) / jnp.sqrt(2.0)
+        return value + p["scale"] * loss * tail * _shared(context)
+
+    return [
+        Effect(
+            "diffuse_scattering",
+            {"noiseless_channel": fill},
+            (half_normal("scale", 0.2),),
+            kind="variance",
+            physics="Dense multipath from the first arrival on, exponential in delay, white over antennas;"
+            " its rms is the size times that of all paths in free space.",
+            source="Richter, Estimation of Radio Channel Parameters, TU Ilmenau 2005, ch. 2.",
+            requires=_NEEDS,
+            field_shape=lambda value, _: (value.shape[0], 1, value.shape[2], value.shape[3], 1, taps, 2),
+        )
+    ]
+
+
+def _sums_paths(sites: Sites) -> bool:
+    return has_phase(sites) and offers(sites, "path_phase", "frequency_response")
+
+
+def _path(
+    context: Mapping[str, Any],
+    departure: Float[Array, "link 3"],
+    arrival: Float[Array, "link 3"],
+    length: Float[Array, " link"],
+) -> Complex[Array, "link 1 rx_antenna tx_antenna subcarrier"]:
+    """One path per link of unit gain, given by its directions of travel and its length in m."""
+    paths = context["paths"]
+    tones = 1.0 / paths.wavelength + jnp.asarray(context["subcarrier_frequency"]) / speed_of_light
+    tone = phasor(-2 * jnp.pi * length[:, None] * tones)
+    rx = _response(context, "rx_array", arrival, -1.0)
+    tx = _response(context, "tx_array", departure, 1.0)
+    return jnp.einsum("lr,lt,lk->lrtk", rx, tx, tone)[:, None] * _shared(context)
+
+
+def _shared(context: Mapping[str, Any]) -> Complex[Array, "*link_snapshot_rx_tx_subcarrier"]:
+    """What all paths share on their way into the measurement, broadcastable to the channel."""
+    factor = phasor(context["path_phase"][:, :, :1, None, None]) * context["frequency_response"]
+    if "receiver_gain" in context:
+        factor = factor * context["receiver_gain"][:, None, None, None, None]
+    if "receiver_delay" in context:
+        turn = context["receiver_delay"][:, None] * jnp.asarray(context["subcarrier_frequency"])
+        factor = factor * phasor(-2 * jnp.pi * turn)[:, None, None, None, :]
+    return factor
+
+
+def _response(
+    context: Mapping[str, Any], name: str, direction: Float[Array, "link 3"], sign: float
+) -> Complex[Array, "link antenna"]:
+    array = context.get(name)
+    positions = jnp.zeros((1, 3)) if array is None else jnp.asarray(array)
+    return steering(positions, direction[:, None], context["paths"].frequency, sign)[:, 0]
+
+
+def _leg(start: Any, stop: Any) -> tuple[jax.Array, jax.Array]:
+    """Unit vector and distance in m from one point to another, per link."""
+    step = jnp.asarray(stop) - jnp.asarray(start)
+    length = jnp.maximum(jnp.linalg.norm(step, axis=-1), 1e-3)
+    return step / length[:, None], length
+
+
+def _obstructed(paths: PathSet) -> jax.Array:
+    """Links without an existing path of order 0."""
+    direct = jnp.all(jnp.asarray(paths.interaction) == NONE, axis=-1) & paths.mask
+    return ~jnp.any(direct, axis=-1)
+
+
+def _free_space(paths: PathSet) -> jax.Array:
+    """Free-space gain lambda / (4 pi L) of every path, 0 where there is none."""
+    return jnp.where(
+        paths.mask, paths.wavelength / (4 * jnp.pi * jnp.where(paths.mask, paths.length, 1.0)), 0.0
+    )
+
+
+def _delay_spread(paths: PathSet) -> float:
+    """Rms delay in s of all paths after the first of their link, each weighed by its free-space power."""
+    mask, delay = np.asarray(paths.mask), np.asarray(paths.delay)
+    first = np.min(np.where(mask, delay, np.inf), axis=1, keepdims=True)
+    power = np.asarray(_free_space(paths)) ** 2
+    excess = np.where(mask, delay - np.where(np.isfinite(first), first, 0.0), 0.0)
+    return float(np.sqrt(np.sum(power * excess**2) / max(float(np.sum(power)), 1e-300)))
+
+
+def _text(point: np.ndarray) -> str:
+    return "(" + " ".join(f"{x:.1f}" for x in point) + ") m"
+
+
+FAMILIES: Final[dict[str, Family]] = {
+    "extra_path": extra_path,
+    "diffraction": diffraction,
+    "diffuse_scattering": diffuse_scattering,
+}

@@ -1,0 +1,104 @@
+"""The table of all families of effects, and the choice of those that a model and its data allow."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from typing import Final
+
+from dtprob.effects import (
+    array,
+    displacement,
+    extra,
+    front_end,
+    loss,
+    motion,
+    noise,
+    nonlinearity,
+    surface,
+    visibility,
+)
+from dtprob.effects.common import Data, Family, Sites
+from dtprob.effects.effect import Effect
+from dtprob.errors import InputError, nearest, unknown_name
+
+FAMILIES: Final[dict[str, Family]] = {
+    **displacement.FAMILIES,
+    **surface.FAMILIES,
+    **visibility.FAMILIES,
+    **extra.FAMILIES,
+    **loss.FAMILIES,
+    **array.FAMILIES,
+    **front_end.FAMILIES,
+    **nonlinearity.FAMILIES,
+    **motion.FAMILIES,
+    **noise.FAMILIES,
+}
+"""For each family's name, the function (sites, data) -> its instances on such a model and data."""
+
+
+def catalogue(sites: Sites, data: Data, use: str | Iterable[str | Effect] = "all") -> tuple[Effect, ...]:
+    """The effects that a model's sites and data allow.
+
+    Args:
+        sites: `declare(model, data).sites`.
+        data: the model's arguments by name, with concrete arrays.
+        use: "all", or names of families ("doppler") or instances ("array_calibration[rx_1]"), or effects of
+            the user's own, which are taken as they are.
+
+    Returns:
+        The effects in the order of the table, or of `use`; no name twice.
+
+    Raises:
+        InputError: a name is unknown, the model or the data do not allow it, an effect of the user's names a
+            site that the model lacks, or two effects have one name.
+    """
+    if use == "all":
+        return _unique([effect for family in FAMILIES.values() for effect in family(sites, data)])
+    chosen: list[Effect] = []
+    for entry in [use] if isinstance(use, str) else use:
+        chosen += [_checked(entry, sites)] if isinstance(entry, Effect) else _named(entry, sites, data)
+    return _unique(chosen)
+
+
+def summaries() -> dict[str, str]:
+    """For each family's name, one line that says what it is."""
+    return {name: (family.__doc__ or "").strip().splitlines()[0] for name, family in FAMILIES.items()}
+
+
+def _named(name: str, sites: Sites, data: Data) -> list[Effect]:
+    """All instances of a family, or the one instance of that name."""
+    family = name.partition("[")[0]
+    if family not in FAMILIES:
+        raise unknown_name("effects", name, FAMILIES, "effect family")
+    offered = list(FAMILIES[family](sites, data))
+    found = offered if name == family else [effect for effect in offered if effect.name == name]
+    if found:
+        return found
+    names = [effect.name for effect in offered]
+    close = nearest(name, names)
+    raise InputError(
+        "effects",
+        f"an effect that this model and data allow ({', '.join(names[:8]) or f'no {family}'})",
+        repr(name),
+        f"Did you mean {close!r}?" if close else "Leave it out, or give the sites and data that it needs.",
+    )
+
+
+def _checked(effect: Effect, sites: Sites) -> Effect:
+    missing = [site for site in effect.sites if site not in sites]
+    if missing:
+        raise InputError(
+            f"effect {effect.name}",
+            f"sites among {', '.join(sites)}",
+            ", ".join(missing),
+            "Name the site in the model, or leave the effect out.",
+        )
+    return effect
+
+
+def _unique(effects: list[Effect]) -> tuple[Effect, ...]:
+    twice = [name for name, count in Counter(effect.name for effect in effects).items() if count > 1]
+    if twice:
+        raise InputError("effects", "each name once", f"{', '.join(twice)} twice", "Rename one of them.")
+    return tuple(effects)

@@ -1,0 +1,330 @@
+"""Effects against results by hand, or against the same world built otherwise."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from numpyro import handlers
+from scipy.spatial.transform import Rotation
+
+from dtprob.effects import Rewriting, catalogue
+from dtprob.raytracing.field import path_gain
+
+SPEED = 299_792_458.0
+SHARED = {"path_phase": jnp.zeros((3, 1, 7)), "frequency_response": jnp.ones(17, complex)}
+
+
+@pytest.fixture(scope="module")
+def apply(world):
+    """Function (name, parameters) -> values of all sites with that effect, or of the base model."""
+
+    def run(name=None, data=None, **parameters):
+        data = world.data if data is None else data
+        chosen = [] if name is None else list(catalogue(world.sites, world.data, [name]))[:1]
+        given = {e.name: {k: jnp.asarray(v, float) for k, v in parameters.items()} for e in chosen}
+        with (
+            handlers.trace() as trace,
+            Rewriting(None, chosen, given, data),
+            handlers.seed(rng_seed=0),
+            handlers.substitute(data={"scale": jnp.ones(())}),
+        ):
+            world.model(**data)
+        return {n: np.asarray(m["value"]) for n, m in trace.items() if m["type"] == "deterministic"}
+
+    return run
+
+
+def test_timing_offset_turns_subcarriers_in_proportion(world, apply):
+    frequency = np.asarray(world.data["subcarrier_frequency"])
+    ratio = apply("timing_offset", delay=3e-9)["noiseless_channel"] / apply()["noiseless_channel"]
+    assert np.allclose(ratio, np.exp(-2j * np.pi * frequency * 3e-9), rtol=1e-9)
+
+
+def test_carrier_frequency_offset_turns_snapshots_in_proportion(world, apply):
+    time = np.asarray(world.data["snapshot_time"])[:, None, None, None]
+    ratio = (
+        apply("carrier_frequency_offset", frequency=70.0)["noiseless_channel"] / apply()["noiseless_channel"]
+    )
+    assert ratio.shape[1] == 8
+    assert np.allclose(ratio, np.exp(2j * np.pi * 70.0 * time), rtol=1e-9)
+
+
+def test_sampling_clock_offset_drifts(world, apply):
+    time = np.asarray(world.data["snapshot_time"])[:, None, None, None]
+    frequency = np.asarray(world.data["subcarrier_frequency"])
+    ratio = apply("sampling_clock_offset", offset=1e-5)["noiseless_channel"] / apply()["noiseless_channel"]
+    assert np.allclose(ratio, np.exp(-2j * np.pi * frequency * 1e-5 * time), rtol=1e-9)
+
+
+MOVES = {
+    "receiver_displacement": ("rx", [0.3, -0.2, 0.15]),
+    "transmitter_displacement": ("tx", [-0.2, 0.25, 0.1]),
+}
+
+
+@pytest.mark.parametrize("name", list(MOVES))
+def test_displaced_ends_agree_with_tracing_again(world, apply, trace_world, name):
+    end, step = MOVES[name]
+    again, mask = trace_world(**{end: np.array(step)}), np.asarray(world.data["paths"].mask)
+    sites = apply(name, displacement=step)
+    _compare(sites, again, mask)
+
+
+@pytest.mark.parametrize(("index", "name"), [(0, "east"), (1, "slanted"), (2, "floor")])
+def test_displaced_object_agrees_with_tracing_again(world, apply, trace_world, index, name):
+    normal = {"east": [1.0, 0, 0], "slanted": [0.6, 0.8, 0], "floor": [0, 0, 1.0]}[name]
+    planes = np.zeros((4, 3))
+    planes[index] = 0.4 * np.array(normal)
+    sites = apply(f"object_displacement[{name}]", displacement=[0.4])
+    _compare(sites, trace_world(planes=planes), np.asarray(world.data["paths"].mask))
+
+
+def _compare(sites, again, mask):
+    """The rewritten geometry is that of the world traced with the thing moved, to rounding."""
+    assert np.max(np.abs(sites["path_delay"] - np.asarray(again.delay))[mask]) < 1e-20
+    assert np.allclose(sites["arrival"][mask], np.asarray(again.arrival)[mask], atol=1e-12)
+    assert np.allclose(sites["departure"][mask], np.asarray(again.departure)[mask], atol=1e-12)
+
+
+def test_displaced_path_keeps_the_free_space_law(world, apply):
+    before, after = apply(), apply("receiver_displacement", displacement=[0.3, 0.0, 0.0])
+    mask = np.asarray(world.data["paths"].mask)
+    weakened = before["path_gain"][mask] / after["path_gain"][mask]
+    assert np.allclose(weakened, (after["path_delay"] / before["path_delay"])[mask], rtol=1e-9)
+
+
+def test_rotated_object_is_right_to_first_order(world, apply):
+    """A plane turned about a point of it: image the transmitter in the turned plane."""
+    paths = world.data["paths"]
+    chosen = catalogue(world.sites, world.data, ["object_rotation[east]"])[0]
+    at = (
+        np.asarray(paths.mask)[..., None]
+        & (np.asarray(paths.object) == 0)
+        & (np.asarray(paths.interaction) == 1)
+    )
+    centre = np.asarray(paths.vertex)[at].mean(axis=0)
+    errors = []
+    for angle in (1e-3, 5e-4):
+        turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
+        normal = turn @ np.array([1.0, 0, 0])
+        tx, rx = np.asarray(paths.tx_position), np.asarray(paths.rx_position)
+        image = tx - 2 * ((tx - centre) @ normal)[:, None] * normal
+        exact = np.linalg.norm(rx - image, axis=1) / SPEED
+        assert chosen.dimension == 2
+        assert "(0.00 1.00 0.00), (0.00 0.00 1.00)" in chosen.physics
+        found = apply("object_rotation[east]", rotation=[0.0, angle])["path_delay"][:, 1]
+        errors.append(np.max(np.abs(found - exact)))
+        assert errors[-1] < 0.05 * np.max(np.abs(exact - np.asarray(paths.delay)[:, 1]))
+    assert errors[1] < 0.3 * errors[0]
+
+
+@pytest.mark.parametrize(
+    ("name", "move"), [("doppler", "rx"), ("doppler[transmitter]", "tx"), ("doppler[slanted]", "planes")]
+)
+def test_doppler_agrees_with_moved_geometry(world, apply, trace_world, name, move):
+    """Phase after a time t is that of the geometry moved by v t, to first order in v t."""
+    velocity, time = (
+        (np.array([0.3, -0.2, 0.1]), 7e-3) if move != "planes" else (np.array([0.6, 0.8, 0.0]), 7e-3)
+    )
+    step = velocity * time
+    if move == "planes":
+        step = np.zeros((4, 3))
+        step[1] = velocity * time
+    delay = np.asarray(trace_world(**{move: step}).delay) - np.asarray(world.data["paths"].delay)
+    exact = -2 * np.pi * world.data["paths"].frequency * delay
+    given = [1.0] if move == "planes" else velocity
+    found = apply(name, velocity=given)["path_phase"]
+    mask = np.asarray(world.data["paths"].mask)
+    assert np.array_equal(found[:, 0], np.zeros_like(exact))
+    assert np.allclose(found[:, -1][mask], exact[mask], rtol=2e-3, atol=1e-4)
+
+
+def test_material_of_one_object_only(apply):
+    sites = apply("material_mismatch[slanted]", log_contrast=np.log(2.0), log_conductivity=np.log(3.0))
+    assert np.allclose(sites["permittivity"], [4.0, 9.0, 4.0, 5.0])
+    assert np.allclose(sites["conductivity"], [0.05, 0.06, 0.05, 0.02])
+
+
+def test_missing_path_and_blockage(world, apply):
+    order = np.sum(np.asarray(world.data["paths"].interaction) != 0, axis=-1)
+    before = apply()["path_gain"]
+    gone = apply("missing_path[order_1]", fraction=1.0)["path_gain"]
+    assert np.array_equal(gone, np.where(order == 1, 0.0, before))
+    hidden = apply("blockage[line_of_sight]", loss=0.7)["path_gain"]
+    assert np.allclose(hidden, np.where(order == 0, np.exp(-0.7), 1.0) * before)
+
+
+def test_losses_by_hand(world, apply):
+    paths = world.data["paths"]
+    before, length = apply()["path_gain"], np.asarray(paths.length)
+    assert np.allclose(
+        apply("atmospheric_attenuation", rate=0.02)["path_gain"], before * np.exp(-0.02 * length)
+    )
+    mask = np.asarray(paths.mask)
+    ratio = apply("path_loss_exponent", excess=0.5)["path_gain"][mask] / before[mask]
+    slope = np.polyfit(np.log(length[mask]), np.log(np.abs(ratio)), 1)[0]
+    assert np.isclose(slope, -0.25)
+    rough = apply("rough_surface[floor]", roughness=0.3)["path_gain"]
+    cosine = np.abs(np.asarray(paths.departure)[:, 3, 2])
+    assert np.allclose(rough[:, 3], before[:, 3] * np.exp(-0.3 * cosine**2))
+    assert np.array_equal(rough[:, 0], before[:, 0])
+    twice = apply("penetration[partition]", loss=0.2, phase=0.1)["path_gain"]
+    assert np.allclose(twice[1, 6], before[1, 6] * np.exp(-0.2 + 0.1j))
+
+
+@pytest.mark.parametrize("side", ["rx", "tx"])
+def test_polarisation_crossed_by_a_right_angle(world, apply, side):
+    import equinox as eqx
+
+    paths = world.data["paths"]
+    direction = paths.arrival if side == "rx" else paths.departure
+    crossed = jnp.cross(direction, getattr(paths, f"{side}_field"))
+    other = eqx.tree_at(lambda p: getattr(p, f"{side}_field"), paths, crossed)
+    expected = path_gain(other, paths.permittivity, paths.conductivity)
+    found = apply(f"polarization_mismatch[{side}]", rotation=np.pi / 2, ellipticity=0.0)["path_gain"]
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-15)
+
+
+@pytest.mark.parametrize("side", ["rx", "tx"])
+def test_array_geometry_agrees_with_other_positions(world, apply, side):
+    positions = np.asarray(world.data[f"{side}_array"])
+    wide = apply(data={**world.data, f"{side}_array": jnp.asarray(1.03 * positions)})
+    found = apply(f"element_spacing[{side}]", scale=0.03)
+    assert np.allclose(found[f"{side}_response"], wide[f"{side}_response"])
+
+    effect = catalogue(world.sites, world.data, [f"antenna_orientation[{side}]"])[0]
+    axis = np.array([0.0, 0.0, 1.0])  # visible for both arrays
+    turned = positions @ Rotation.from_rotvec(2 * np.arctan(0.1) * axis).as_matrix().T
+    given = np.zeros(effect.dimension)
+    given[-1] = 0.2
+    expected = apply(data={**world.data, f"{side}_array": jnp.asarray(turned)})
+    found = apply(effect.name, rotation=given)
+    assert np.allclose(found[f"{side}_response"], expected[f"{side}_response"])
+    assert effect.dimension == {"rx": 3, "tx": 2}[side]  # nobody sees a line turn about itself
+
+
+def test_near_field_is_the_sphere(world, apply):
+    paths, array = world.data["paths"], 10 * np.asarray(world.data["rx_array"])
+    data = {**world.data, "rx_array": jnp.asarray(array)}
+    found = np.angle(apply("near_field[rx]", data=data, share=1.0)["rx_response"])
+    flat = np.angle(apply(data=data)["rx_response"])
+    vector = (np.asarray(paths.length)[..., None] * np.asarray(paths.arrival))[:, :, None] + array
+    distance = np.linalg.norm(vector, axis=-1) - np.asarray(paths.length)[..., None]
+    sphere = -2 * np.pi / paths.wavelength * distance
+
+    def error(phase):
+        return np.max(np.abs(np.angle(np.exp(1j * (phase - sphere))))[np.asarray(paths.mask)])
+
+    assert error(found) < 0.15 * error(flat)
+
+
+def test_coupling_of_neighbours_on_a_line(apply):
+    before = apply()["tx_response"]
+    found = apply("mutual_coupling[tx]", coupling=[0.1, -0.05])["tx_response"]
+    c = 0.1 - 0.05j
+    matrix = np.array([[1, c, 0], [c, 1, c], [0, c, 1]])
+    assert np.allclose(found, before @ matrix.T)
+
+
+def test_calibration_and_cable_of_one_element(world, apply):
+    before = apply()
+    found = apply("array_calibration[rx_2]", log_gain=0.3, phase=-0.4)["rx_response"]
+    assert np.allclose(found[..., 2], before["rx_response"][..., 2] * np.exp(0.3 - 0.4j))
+    assert np.array_equal(found[..., [0, 1, 3]], before["rx_response"][..., [0, 1, 3]])
+    ratio = apply("cable_delay[tx_1]", delay=2e-9)["noiseless_channel"] / before["noiseless_channel"]
+    turn = np.exp(-2j * np.pi * np.asarray(world.data["subcarrier_frequency"]) * 2e-9)
+    assert np.allclose(ratio[:, :, :, 1], turn)
+    assert np.allclose(ratio[:, :, :, [0, 2]], 1.0)
+
+
+def test_iq_imbalance_mixes_mirror_subcarriers(apply):
+    before, g, phi = apply()["noiseless_channel"], 0.1, 0.06
+    mu = np.cos(phi / 2) + 1j * g * np.sin(phi / 2)
+    nu = g * np.cos(phi / 2) - 1j * np.sin(phi / 2)
+    found = apply("iq_imbalance", amplitude=g, phase=phi)["noiseless_channel"]
+    assert np.allclose(found, mu * before + nu * np.conj(before[..., ::-1]))
+
+
+def test_compression_saturates(world, apply):
+    before = apply()["noiseless_channel"]
+    power = np.mean(np.abs(np.asarray(world.data["channel"])) ** 2)
+    found = apply("amplifier_nonlinearity", compression=0.2)["noiseless_channel"]
+    assert np.allclose(found, before / (1 + 0.2 * np.abs(before) ** 2 / power))
+
+
+def test_noise_by_hand(world, apply):
+    before, signal = apply()["noise_power"], np.abs(apply()["noiseless_channel"]) ** 2
+    quantized = apply("quantization", ratio=1e-3)["noise_power"]
+    assert np.allclose(quantized, before + 1e-3 * signal.mean(axis=(2, 3, 4), keepdims=True))
+    assert np.allclose(apply("error_vector_magnitude", ratio=1e-3)["noise_power"], before + 1e-3 * signal)
+    jammed = apply("interference[band_7]", excess=2.0)["noise_power"].ravel() / before.ravel()
+    assert np.array_equal(jammed, np.where(np.arange(17) >= 14, 3.0, 1.0))
+    burst = apply("interference[time_0]", excess=2.0)["noise_power"].ravel() / before.ravel()
+    assert np.array_equal(burst, np.where(np.arange(8) < 1, 3.0, 1.0))
+
+
+def test_extra_path_is_a_radar_echo(world, apply):
+    paths = world.data["paths"]
+    added = (
+        apply("extra_path[floor]", scattering=[0.5, 0.0])["noiseless_channel"] - apply()["noiseless_channel"]
+    )
+    at = (
+        np.asarray(paths.mask)[..., None]
+        & (np.asarray(paths.object) == 2)
+        & (np.asarray(paths.interaction) == 1)
+    )
+    point = np.asarray(paths.vertex)[at].mean(axis=0)
+    first = np.linalg.norm(point - np.asarray(paths.tx_position), axis=1)
+    second = np.linalg.norm(np.asarray(paths.rx_position) - point, axis=1)
+    size = paths.wavelength * 0.5 / ((4 * np.pi) ** 1.5 * first * second)
+    assert np.allclose(np.abs(added), size[:, None, None, None, None])
+    slope = np.diff(np.unwrap(np.angle(added[:, 0, 0, 0])), axis=-1)
+    assert np.allclose(slope, -2 * np.pi * 2e6 * ((first + second) / SPEED)[:, None])
+
+
+def test_diffraction_reaches_obstructed_links_only(world):
+    effect = catalogue(world.sites, world.data, ["diffraction"])[0]
+    value = jnp.zeros((3, 1, 4, 3, 17), complex)
+    context = {**world.data, **SHARED}
+    shape = effect.shape_of_field(value, context)
+    given = {"scale": jnp.asarray(1.0), "field": jnp.ones(shape)}
+    added = np.abs(effect.rewrites["noiseless_channel"](value, given, context))
+    assert np.all(added[[0, 2]] == 0)
+    assert np.all(added[1] > 0)
+
+
+def test_diffuse_tail_has_the_stated_power(world):
+    import jax
+
+    effect = catalogue(world.sites, world.data, ["diffuse_scattering"])[0]
+    value, paths = jnp.zeros((3, 1, 4, 3, 17), complex), world.data["paths"]
+    shape = effect.shape_of_field(value, world.data)
+    power = 0.0
+    for key in jax.random.split(jax.random.key(0), 50):
+        given = {"scale": jnp.asarray(0.3), "field": jax.random.normal(key, shape)}
+        tail = effect.rewrites["noiseless_channel"](value, given, {**world.data, **SHARED})
+        power = power + np.mean(np.abs(tail) ** 2, axis=(1, 2, 3, 4)) / 50
+    free = paths.wavelength / (4 * np.pi * np.asarray(paths.length))
+    expected = 0.09 * np.sum(np.where(np.asarray(paths.mask), free**2, 0.0), axis=1)
+    assert np.allclose(power, expected, rtol=0.15)
+
+
+def test_added_paths_get_what_all_paths_share(world):
+    """Gain, delay, phase and response of a receiver act on an added path as on the traced ones."""
+    effect = catalogue(world.sites, world.data, ["extra_path[floor]"])[0]
+    value, given = jnp.zeros((3, 1, 4, 3, 17), complex), {"scattering": jnp.asarray([0.3, 0.1])}
+    frequency = np.asarray(world.data["subcarrier_frequency"])
+    plain = effect.rewrites["noiseless_channel"](value, given, {**world.data, **SHARED})
+    receiver = {
+        "path_phase": 0.4 + SHARED["path_phase"],
+        "frequency_response": 0.5j * SHARED["frequency_response"],
+        "receiver_gain": jnp.asarray([1.0, 2.0, 3.0]),
+        "receiver_delay": jnp.asarray([0.0, 1e-9, 2e-9]),
+    }
+    found = effect.rewrites["noiseless_channel"](value, given, {**world.data, **receiver})
+    expected = (
+        0.5j
+        * np.exp(0.4j)
+        * np.array([1, 2, 3])[:, None]
+        * np.exp(-2j * np.pi * np.array([0, 1e-9, 2e-9])[:, None] * frequency)
+    )
+    assert np.allclose(found, plain * expected[:, None, None, None])

@@ -1,0 +1,144 @@
+"""Which effects are offered for which model and data, and how they are chosen."""
+
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects import FAMILIES, Effect, Parameter, catalogue, summaries
+from dtprob.errors import InputError
+from dtprob.models.declaration import Site, declare
+
+USER = Effect(
+    "mine", {"path_gain": lambda value, p, _: value * (1 + p["a"])}, (Parameter("a", dist.Normal()),)
+)
+
+
+def families(world):
+    return {effect.family for effect in catalogue(world.sites, world.data)}
+
+
+def test_every_family_says_what_it_is():
+    lines = summaries()
+    assert set(lines) == set(FAMILIES)
+    assert all(line.endswith(".") and len(line) < 110 for line in lines.values())
+
+
+def test_names_are_unique(world):
+    names = [effect.name for effect in catalogue(world.sites, world.data)]
+    assert len(set(names)) == len(names) > 130
+
+
+def test_without_time_nothing_moves(build_world):
+    offered = families(build_world(snapshot_time=None))
+    assert not offered & {
+        *(
+            "doppler",
+            "carrier_frequency_offset",
+            "carrier_phase_drift",
+            "sampling_clock_offset",
+            "gain_drift",
+        ),
+    }
+    assert "phase_noise" in offered
+
+
+def test_single_antennas_have_no_array(build_world):
+    world = build_world(rx_array=None, tx_array=None)
+    offered = families(world)
+    assert not offered & {
+        *("array_calibration", "cable_delay", "mutual_coupling", "element_spacing", "antenna_orientation"),
+        *("near_field", "angular_spread"),
+    }
+    assert "antenna_pattern" in offered
+    assert [e.instance for e in catalogue(world.sites, world.data, "iq_imbalance")] == [None]
+
+
+def test_two_antennas_are_calibrated_once(build_world, world):
+    pair = build_world(tx_array=world.data["tx_array"][:2])
+    names = [e.name for e in catalogue(pair.sites, pair.data, ["array_calibration", "cable_delay"])]
+    assert [name for name in names if "tx" in name] == ["array_calibration[tx]", "cable_delay[tx_1]"]
+
+
+def test_one_subcarrier_has_no_band(build_world, world):
+    offered = families(build_world(subcarrier_frequency=world.data["subcarrier_frequency"][:1]))
+    assert not offered & {
+        *("timing_offset", "frequency_response", "frequency_ripple", "iq_imbalance", "colored_noise"),
+        *("cable_delay", "estimator_smoothing"),
+    }
+    assert {"carrier_phase", "amplifier_nonlinearity", "diffuse_scattering"} <= offered
+
+
+def test_a_band_beside_the_carrier_has_no_mirror(build_world, world):
+    shifted = build_world(subcarrier_frequency=world.data["subcarrier_frequency"] + 1e8)
+    assert "iq_imbalance" not in families(shifted)
+    assert [e.instance for e in catalogue(shifted.sites, shifted.data, "crosstalk")] == [None]
+
+
+def test_packets_of_arbitrary_phase_have_no_common_one(world):
+    data = {**world.data, "phase": "per_packet"}
+    offered = {effect.family for effect in catalogue(world.sites, data)}
+    assert not offered & {"carrier_phase", "phase_noise", "carrier_phase_drift", "carrier_frequency_offset"}
+    assert {"phase_error", "timing_offset", "doppler"} <= offered
+
+
+def test_known_noise_can_be_wrong_unknown_noise_cannot(build_world):
+    assert "noise_level" not in families(build_world(noise_power=None))
+
+
+def test_path_phases_of_the_model_are_no_effect(world):
+    angle = Site(
+        "z", "latent", (3, 1, 7), ("link", "snapshot", "path"), (), support=dist.constraints.circular
+    )
+    offered = {effect.family for effect in catalogue({**world.sites, "z": angle}, world.data)}
+    assert "phase_error" not in offered
+
+
+def test_powers_alone_offer_no_phases(world):
+    sites = {n: world.sites[n] for n in ("permittivity", "conductivity", "path_gain", "departure", "arrival")}
+    effects = catalogue(sites, world.data)
+    offered = {effect.family for effect in effects}
+    assert offered == {
+        *("material_mismatch", "reflection_loss", "rough_surface", "penetration", "polarization_mismatch"),
+        *("missing_path", "blockage", "shadowing", "path_gain_error", "atmospheric_attenuation"),
+        *("path_loss_exponent", "antenna_pattern"),
+    }
+    assert all(p.name != "phase" for effect in effects for p in effect.parameters)
+
+
+def test_other_models_get_nothing_they_cannot_use():
+    def coin(y=None):
+        numpyro.sample("y", dist.Bernoulli(logits=numpyro.deterministic("logit", 0.3)), obs=y)
+
+    assert catalogue(declare(coin, {"y": 1}).sites, {"y": 1}) == ()
+
+
+def test_choosing_by_name(world):
+    def chosen(use):
+        return [effect.name for effect in catalogue(world.sites, world.data, use)]
+
+    assert chosen("timing_offset") == ["timing_offset", "timing_offset[each_packet]"]
+    assert chosen(["doppler[floor]", "gain_offset", USER]) == ["doppler[floor]", "gain_offset", "mine"]
+    assert chosen([]) == []
+
+
+@pytest.mark.parametrize(
+    ("use", "message"),
+    [
+        ("timing_ofset", "Did you mean 'timing_offset'"),
+        ("doppler[flor]", r"Did you mean 'doppler\[floor\]'"),
+        (["gain_offset", "gain_offset"], "gain_offset twice"),
+        (
+            [Effect("bad", {"tau": USER.rewrites["path_gain"]}, USER.parameters)],
+            "effect bad: expected sites among",
+        ),
+    ],
+)
+def test_wrong_names_say_what_to_do(world, use, message):
+    with pytest.raises(InputError, match=message):
+        catalogue(world.sites, world.data, use)
+
+
+def test_a_family_that_the_data_do_not_allow(build_world):
+    world = build_world(snapshot_time=None)
+    with pytest.raises(InputError, match="no doppler"):
+        catalogue(world.sites, world.data, ["doppler"])
