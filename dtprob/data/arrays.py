@@ -1,0 +1,143 @@
+"""Named arrays with declared axes: one table per kind of data, one check for all of them."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from dtprob.errors import InputError, unknown_name
+
+type Axis = str | int
+type NumberKind = Literal["complex", "real", "integer"]
+
+
+@dataclass(frozen=True)
+class ArraySpec:
+    """What an array of a data file must look like.
+
+    Attributes:
+        shapes: the allowed shapes, as axis names (equal names have equal sizes) and fixed sizes.
+        kind: the kind of number.
+        required: whether the array must be there.
+        lower: the smallest allowed value, if any.
+        positive: whether zero is refused as well.
+        missing: whether NaN may stand for a value that was not measured.
+    """
+
+    shapes: tuple[tuple[Axis, ...], ...]
+    kind: NumberKind = "real"
+    required: bool = False
+    lower: float | None = None
+    positive: bool = False
+    missing: bool = False
+
+
+_DTYPE = {"complex": np.complex128, "real": np.float64, "integer": np.int64}
+_ACCEPTED = {"complex": "cfiu", "real": "fiub", "integer": "iub"}
+
+
+def check_arrays(arrays: Mapping[str, object], specs: Mapping[str, ArraySpec]) -> dict[str, np.ndarray]:
+    """Bring the arrays to their declared type and check them against ``specs``, in the order of ``specs``.
+
+    Args:
+        arrays: array-likes by name; a value of None counts as absent.
+        specs: the declared arrays by name; the first ones fix the sizes of the axes.
+
+    Returns:
+        the arrays that are there, read-only, in double precision.
+
+    Raises:
+        InputError: an unknown name (the nearest valid one is named), a required array missing, a wrong type,
+            rank or size, a NaN or infinity (with its first index), a value out of range.
+    """
+    given = {name: np.asarray(value) for name, value in arrays.items() if value is not None}
+    for name in given:
+        if name not in specs:
+            raise unknown_name("array", name, specs, "array name")
+    sizes: dict[str, int] = {}
+    checked: dict[str, np.ndarray] = {}
+    for name, spec in specs.items():
+        if name in given:
+            checked[name] = _check(name, given[name], spec, sizes)
+        elif spec.required:
+            shape = _show(spec.shapes[0], sizes)
+            raise InputError(name, f"an array of shape {shape}", "nothing", "Add this array to the data")
+    return checked
+
+
+def _check(name: str, array: np.ndarray, spec: ArraySpec, sizes: dict[str, int]) -> np.ndarray:
+    array = _convert(name, array, spec.kind)
+    shape = _match(name, array.shape, spec.shapes, sizes)
+    for axis, size in zip(shape, array.shape, strict=True):
+        if isinstance(axis, str):
+            sizes.setdefault(axis, size)
+            if size == 0:
+                raise InputError(
+                    name, f"at least one {axis}", "an empty array", "Leave out what was not measured"
+                )
+    check_finite(name, array, allow_nan=spec.missing)
+    _check_range(name, array, spec)
+    array.setflags(write=False)
+    return array
+
+
+def _convert(name: str, array: np.ndarray, kind: NumberKind) -> np.ndarray:
+    if array.dtype.kind == "f" and kind == "integer" and np.array_equal(array, np.round(array)):
+        array = array.astype(np.int64)
+    if array.dtype.kind not in _ACCEPTED[kind]:
+        got = f"values of type {array.dtype}"
+        raise InputError(name, f"{kind} numbers", got, f"Store {name} as {kind} numbers")
+    return array.astype(_DTYPE[kind])
+
+
+def _match(
+    name: str, shape: tuple[int, ...], allowed: tuple[tuple[Axis, ...], ...], sizes: Mapping[str, int]
+) -> tuple[Axis, ...]:
+    for candidate in allowed:
+        if len(candidate) == len(shape) and all(
+            sizes.get(axis, size) == size if isinstance(axis, str) else axis == size
+            for axis, size in zip(candidate, shape, strict=True)
+        ):
+            return candidate
+    expected = " or ".join(_show(candidate, sizes) for candidate in allowed)
+    same_rank = any(len(candidate) == len(shape) for candidate in allowed)
+    remedy = (
+        f"Make the sizes of {name} agree with the other arrays" if same_rank else f"Give {name} these axes"
+    )
+    raise InputError(name, f"shape {expected}", str(shape), remedy)
+
+
+def _show(shape: tuple[Axis, ...], sizes: Mapping[str, int]) -> str:
+    if not shape:
+        return "() (a scalar)"
+    parts = [f"{axis}={sizes[axis]}" if axis in sizes else str(axis) for axis in map(_as_key, shape)]
+    return f"({', '.join(parts)}{',' if len(parts) == 1 else ''})"
+
+
+def _as_key(axis: Axis) -> str:
+    return str(axis)
+
+
+def check_finite(name: str, array: np.ndarray, *, allow_nan: bool = False) -> None:
+    """Raise an InputError that names the array and the first index of a NaN or an infinity."""
+    bad = ~np.isfinite(array)
+    if allow_nan:
+        bad &= ~np.isnan(array)
+    if bad.any():
+        index = tuple(int(i) for i in np.argwhere(bad)[0])
+        got = "NaN" if np.isnan(array[index]) else "infinity"
+        place = f" at index {index if len(index) != 1 else index[0]}" if index else ""
+        raise InputError(name, "finite numbers", f"{got}{place}", "Remove or repair what was not measured")
+
+
+def _check_range(name: str, array: np.ndarray, spec: ArraySpec) -> None:
+    if spec.lower is None or array.size == 0:
+        return
+    present = array[~np.isnan(array)] if spec.missing else array
+    lowest = present.min() if present.size else spec.lower
+    if lowest < spec.lower or (spec.positive and lowest == spec.lower):
+        bound = (
+            f"values {'above' if spec.positive else 'from'} {spec.lower:g}{'' if spec.positive else ' up'}"
+        )
+        raise InputError(name, bound, f"{lowest:g}", f"Check the unit and sign of {name}")

@@ -1,0 +1,161 @@
+"""Files to named arrays, whatever the format. No format that can run code is read."""
+
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dtprob.errors import InputError
+
+type Arrays = dict[str, np.ndarray]
+
+_NETCDF_DIMENSION_ONLY = b"This is a netCDF dimension but not a netCDF variable"
+
+
+def load_arrays(path: Path) -> Arrays:
+    """All arrays (or columns) of a file by name.
+
+    Args:
+        path: a file of a format in ``FORMATS``, told by its suffix.
+
+    Returns:
+        the arrays as stored; columns of a table as 1-D arrays; text as NumPy text.
+
+    Raises:
+        InputError: no such file, an unknown format, a file that is damaged or holds Python objects.
+    """
+    if not path.exists():
+        raise InputError(str(path), "a data file", "no such file", "Check the name and the folder")
+    reader = FORMATS.get(path.suffix.lower())
+    if reader is None:
+        got = f"the suffix '{path.suffix}'"
+        raise InputError(
+            str(path), f"one of {', '.join(FORMATS)}", got, "Save the data in one of these formats"
+        )
+    try:
+        arrays = reader(path)
+    except InputError:
+        raise
+    except ImportError as error:
+        raise InputError(
+            str(path), "a format that can be read here", str(error), _REMEDY[path.suffix]
+        ) from error
+    except Exception as error:
+        reason = str(error).split("\n", maxsplit=1)[0].rstrip(".") or type(error).__name__
+        raise InputError(
+            str(path), f"a readable {path.suffix} file", reason, "Write the file again"
+        ) from error
+    if not arrays:
+        raise InputError(str(path), "named arrays", "none", "Write the arrays under their names")
+    return arrays
+
+
+_REMEDY = {".zarr": "Install it with: pip install 'dtprob[zarr]'"}
+
+
+def _refuse_objects(path: Path, name: str) -> InputError:
+    got = f"Python objects (a pickle) in '{name}'"
+    return InputError(
+        str(path), "plain arrays", got, "Store numbers only; a pickle can run code and is not read"
+    )
+
+
+def _read_npz(path: Path) -> Arrays:
+    if not zipfile.is_zipfile(path):
+        raise InputError(str(path), "an NPZ archive", "another kind of file", "Write it with numpy.savez")
+    arrays: Arrays = {}
+    with np.load(path, allow_pickle=False) as archive:
+        for name in archive.files:
+            try:
+                arrays[name] = archive[name]
+            except ValueError as error:
+                if "pickle" in str(error).lower():
+                    raise _refuse_objects(path, name) from error
+                raise
+    return arrays
+
+
+def _read_hdf5(path: Path) -> Arrays:
+    import h5py  # noqa: PLC0415  (loaded only for this format)
+
+    arrays: Arrays = {}
+    with h5py.File(path, "r") as file:
+        for name, item in file.items():
+            if not isinstance(item, h5py.Dataset) or _NETCDF_DIMENSION_ONLY in _attribute(item, "NAME"):
+                continue
+            array = np.asarray(item.asstr()[...] if h5py.check_string_dtype(item.dtype) else item[...])
+            arrays[name] = array.astype(str) if array.dtype.kind == "O" else _plain_complex(array)
+            if "MATLAB_class" in item.attrs:
+                arrays[name] = arrays[name].T
+    return arrays
+
+
+def _attribute(item: Any, name: str) -> bytes:
+    value = item.attrs.get(name, b"")
+    return value.encode() if isinstance(value, str) else bytes(value)
+
+
+def _plain_complex(array: np.ndarray) -> np.ndarray:
+    """Turn a (real, imaginary) pair of fields into complex numbers."""
+    for real, imaginary in (("r", "i"), ("real", "imag")):
+        if array.dtype.names == (real, imaginary):
+            return array[real] + 1j * array[imaginary]
+    return array
+
+
+def _read_mat(path: Path) -> Arrays:
+    from scipy.io import loadmat  # noqa: PLC0415  (loaded only for this format)
+
+    try:
+        stored = loadmat(path)
+    except NotImplementedError:  # version 7.3 is HDF5
+        return _read_hdf5(path)
+    return {name: np.asarray(value) for name, value in stored.items() if not name.startswith("__")}
+
+
+def _read_zarr(path: Path) -> Arrays:
+    import zarr  # noqa: PLC0415  (an optional extra)
+
+    for metadata in [*path.rglob(".z*"), *path.rglob("zarr.json")]:
+        if metadata.is_file() and '"pickle"' in metadata.read_text(errors="replace"):
+            raise _refuse_objects(path, metadata.parent.name)
+    group = zarr.open_group(path, mode="r")
+    return {name: np.asarray(array[...]) for name, array in group.arrays()}
+
+
+def _read_csv(path: Path) -> Arrays:
+    import pandas as pd  # noqa: PLC0415  (slow to import, needed for tables only)
+
+    return _columns(pd.read_csv(path))
+
+
+def _read_parquet(path: Path) -> Arrays:
+    import pyarrow.parquet as pq  # noqa: PLC0415  (slow to import, needed for tables only)
+
+    return _columns(pq.read_table(path).to_pandas(ignore_metadata=True))
+
+
+def _columns(frame: Any) -> Arrays:
+    columns: Arrays = {}
+    for name in frame.columns:
+        column = frame[name]
+        if column.dtype.kind in "biuf":
+            columns[str(name)] = column.to_numpy(dtype=float if column.dtype.kind == "f" else None)
+        else:
+            columns[str(name)] = column.astype(str).to_numpy(dtype=str)
+    return columns
+
+
+FORMATS: Mapping[str, Callable[[Path], Arrays]] = {
+    ".npz": _read_npz,
+    ".h5": _read_hdf5,
+    ".hdf5": _read_hdf5,
+    ".nc": _read_hdf5,
+    ".zarr": _read_zarr,
+    ".mat": _read_mat,
+    ".csv": _read_csv,
+    ".parquet": _read_parquet,
+}
+"""How each suffix is read."""

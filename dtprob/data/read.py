@@ -1,0 +1,204 @@
+"""Read a data file and tell its kind by what is in it."""
+
+import os
+import re
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dtprob.data import uwb_apartment
+from dtprob.data.arrays import ArraySpec
+from dtprob.data.formats import Arrays, load_arrays
+from dtprob.data.kinds import (
+    CHANNEL_ARRAYS,
+    LABEL_ARRAYS,
+    NETWORK_ARRAYS,
+    POWER_ARRAYS,
+    ChannelData,
+    Data,
+    Labels,
+    NetworkLog,
+    PowerData,
+    Table,
+)
+from dtprob.errors import InputError, unknown_name
+
+_DEVICE_COLUMNS = ("buffer", "action", "ack", "arrival")
+_NUMBERED = re.compile(r"(.+)_(\d+)")
+
+
+def read(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None) -> Data:
+    """Read channels, powers, a network log, labels or a table of other columns.
+
+    The kind is told by the names in the file: ``channel`` makes it ``ChannelData``, ``power`` or ``power_db``
+    ``PowerData``, ``episode``, ``slot`` or ``buffer_0`` a ``NetworkLog``, ``y`` with ``x`` (or ``x_0``, ...)
+    ``Labels``; anything else is a ``Table``.
+
+    Args:
+        path: an .npz, .h5, .hdf5, .nc, .zarr, .mat, .csv or .parquet file, or the folder of the measured set
+            ``uwb_apartment`` (read by ``dtprob.data.uwb_apartment.channels``).
+        options: settings of the reader; only the measured set has some: ``links``, ``averages``, ``level``.
+
+    Raises:
+        InputError: no such file, a format that is not read, a file that holds Python objects, or arrays that
+            are not what their names say (the array is named, and the first index where that helps).
+    """
+    path = Path(path)
+    if (path / uwb_apartment.RESPONSES).is_file():
+        return uwb_apartment.channels(path, **_known(options or {}, ("links", "averages", "level"), path))
+    _known(options or {}, (), path)
+    arrays = load_arrays(path)
+    matlab = path.suffix.lower() == ".mat"
+    try:
+        return _interpret(arrays, matlab=matlab)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error.what}", error.expected, error.got, error.remedy) from None
+
+
+def _known(options: Mapping[str, Any], valid: tuple[str, ...], path: Path) -> dict[str, Any]:
+    for name in options:
+        if not valid:
+            raise InputError(f"options of {path.name}", "none", name, "Leave the options out")
+        if name not in valid:
+            raise unknown_name(f"options of {path.name}", name, valid, "option")
+    return dict(options)
+
+
+def read_table(path: str | os.PathLike[str]) -> Table:
+    """Read a file as columns or arrays by name, without asking what they mean.
+
+    Args:
+        path: a file of any format that ``read`` knows.
+
+    Raises:
+        InputError: as ``read``.
+    """
+    path = Path(path)
+    arrays = load_arrays(path)
+    try:
+        return Table(arrays)
+    except InputError as error:
+        raise InputError(f"{path.name}: {error.what}", error.expected, error.got, error.remedy) from None
+
+
+def _interpret(arrays: Arrays, *, matlab: bool) -> Data:
+    names = set(arrays)
+    if "channel" in names:
+        return _channels(arrays, matlab=matlab)
+    if names & {"power", "power_db"}:
+        return _powers(arrays, matlab=matlab)
+    if names & {"episode", "slot", "buffer_0"}:
+        return _network_log(arrays)
+    if "y" in names and names & {"x", "x_0"}:
+        return _labels(arrays, matlab=matlab)
+    if names & set(CHANNEL_ARRAYS):
+        return _channels(arrays, matlab=matlab)
+    return Table(arrays)
+
+
+def _channels(arrays: Arrays, *, matlab: bool) -> ChannelData:
+    for name in arrays:
+        if name not in CHANNEL_ARRAYS:
+            raise unknown_name("array", name, CHANNEL_ARRAYS, "array name")
+    if "channel" not in arrays:
+        shape = "(link, snapshot, rx_antenna, tx_antenna, subcarrier)"
+        raise InputError("channel", f"an array of shape {shape}", "nothing", "Add this array to the data")
+    return ChannelData(**_canonical(arrays, CHANNEL_ARRAYS, matlab=matlab))
+
+
+def _powers(arrays: Arrays, *, matlab: bool) -> PowerData:
+    arrays = dict(arrays)
+    decibels, reference = arrays.pop("power_db", None), arrays.pop("power_reference", None)
+    if (decibels is None) != (reference is None):
+        have, lack = ("power_db", "power_reference") if reference is None else ("power_reference", "power_db")
+        remedy = (
+            "Give power_db with power_reference, the linear power (W) of 0 dB: 1e-3 for dBm, 1 for a ratio"
+        )
+        raise InputError(lack, f"a value beside {have}", "nothing", remedy)
+    if decibels is not None and reference is not None:
+        if "power" in arrays:
+            raise InputError("power_db", "either power or power_db", "both", "Leave one of them out")
+        _numeric("power_db", decibels)
+        _numeric("power_reference", reference)
+        if reference.size != 1:
+            raise InputError(
+                "power_reference", "one number", f"shape {reference.shape}", "Give the power of 0 dB"
+            )
+        arrays["power"] = reference.item() * 10.0 ** (np.asarray(decibels, dtype=float) / 10.0)
+    valid = [*POWER_ARRAYS, "power_db", "power_reference"]
+    for name in arrays:
+        if name not in POWER_ARRAYS:
+            raise unknown_name("array", name, valid, "array name")
+    return PowerData(**_canonical(arrays, POWER_ARRAYS, matlab=matlab))
+
+
+def _numeric(name: str, array: np.ndarray) -> None:
+    if array.dtype.kind not in "fiu":
+        raise InputError(
+            name, "real numbers", f"values of type {array.dtype}", f"Store {name} as real numbers"
+        )
+
+
+def _network_log(arrays: Arrays) -> NetworkLog:
+    columns = [name for name in arrays if name not in {"episode", "slot"}]
+    devices = 0
+    for name in columns:
+        match = _NUMBERED.fullmatch(name)
+        if match is None or match.group(1) not in _DEVICE_COLUMNS:
+            valid = ["episode", "slot", *(f"{column}_0" for column in _DEVICE_COLUMNS)]
+            raise unknown_name("column", name, valid, "column name")
+        devices = max(devices, int(match.group(2)) + 1)
+    logged = {name: arrays[name] for name in ("episode", "slot") if name in arrays}
+    for column in _DEVICE_COLUMNS:
+        for device in range(max(devices, 1)):
+            if f"{column}_{device}" not in arrays:
+                remedy = "Give every device from 0 its four columns"
+                raise InputError(f"{column}_{device}", "a column", "nothing", remedy)
+        logged[column] = np.stack([arrays[f"{column}_{device}"] for device in range(devices)], axis=1)
+    for name in ("episode", "slot"):
+        if name not in logged:
+            raise InputError(name, "a column", "nothing", "Number the episodes and their slots from 0")
+    return NetworkLog(**_canonical(logged, NETWORK_ARRAYS, matlab=False))
+
+
+def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
+    arrays = dict(arrays)
+    numbered = sorted(
+        (name for name in arrays if re.fullmatch(r"x_\d+", name)), key=lambda name: int(name[2:])
+    )
+    if numbered and "x" not in arrays:
+        if numbered != [f"x_{i}" for i in range(len(numbered))]:
+            raise InputError(
+                "x", f"columns x_0 to x_{len(numbered) - 1}", ", ".join(numbered), "Number them from 0"
+            )
+        arrays["x"] = np.stack([arrays.pop(name) for name in numbered], axis=1)
+    for name in arrays:
+        if name not in {"x", "y", "prediction"}:
+            raise unknown_name("array", name, ["x", "y", "prediction"], "array name")
+    arrays = _canonical(arrays, LABEL_ARRAYS, matlab=matlab)
+    if arrays["x"].ndim == 1:
+        arrays["x"] = arrays["x"][:, None]
+    _numeric("y", arrays["y"])
+    y = np.asarray(arrays["y"], dtype=float)
+    labelled = ~np.isnan(y)
+    return Labels(
+        x=arrays["x"], y=np.where(labelled, y, 0.0), labelled=labelled, prediction=arrays.get("prediction")
+    )
+
+
+def _canonical(arrays: Arrays, specs: Mapping[str, ArraySpec], *, matlab: bool) -> Arrays:
+    """Undo what MATLAB does to shapes: it has no vectors and drops trailing axes of size one."""
+    return (
+        {name: _matlab_shape(array, specs[name]) for name, array in arrays.items()}
+        if matlab
+        else dict(arrays)
+    )
+
+
+def _matlab_shape(array: np.ndarray, spec: ArraySpec) -> np.ndarray:
+    lowest, highest = min(map(len, spec.shapes)), max(map(len, spec.shapes))
+    if highest <= 1 and array.ndim == 2 and 1 in array.shape:
+        return array.reshape(() if lowest == 0 and array.size == 1 else (-1,))
+    return array.reshape(array.shape + (1,) * max(0, highest - array.ndim))

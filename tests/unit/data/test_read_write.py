@@ -1,0 +1,328 @@
+"""What is written is read back; what is wrong is answered by one line that names it."""
+
+import json
+import pickle
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+import scipy.io
+import zarr
+
+from dtprob.data import ChannelData, Labels, NetworkLog, PowerData, Table, read, read_table, write
+from dtprob.errors import InputError
+
+
+def channel_arrays() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(3)
+    shape = (3, 4, 2, 1, 5)
+    return {
+        "channel": rng.normal(size=shape) + 1j * rng.normal(size=shape),
+        "subcarrier_frequency": 30e3 * np.arange(-2, 3),
+        "snapshot_time": 1e-3 * np.arange(4),
+        "rx_position": rng.normal(size=(3, 3)),
+        "tx_position": rng.normal(size=(3, 3)),
+        "rx_array": np.array([[0, -0.01, 0], [0, 0.01, 0]]),
+        "noise_power": np.array([0.1, 0.2, 0.3]),
+        "repeat": np.array([0, 0, 1, 1]),
+    }
+
+
+def power_arrays() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(4)
+    return {
+        "power": rng.uniform(1e-9, 1e-8, (3, 1, 8)),
+        "rx_position": rng.normal(size=(3, 3)),
+        "tx_position": rng.normal(size=(3, 3)),
+    }
+
+
+def log_columns() -> dict[str, np.ndarray]:
+    rng = np.random.default_rng(5)
+    columns = {"episode": np.repeat([0, 1], 5), "slot": np.tile(np.arange(5), 2)}
+    for name in ("buffer", "action", "ack", "arrival"):
+        for device in range(2):
+            columns[f"{name}_{device}"] = rng.integers(0, 2, 10)
+    return columns
+
+
+def save(path, arrays):
+    if path.suffix == ".npz":
+        np.savez(path, **arrays)
+    elif path.suffix in {".h5", ".hdf5", ".nc"}:
+        with h5py.File(path, "w") as file:
+            for name, array in arrays.items():
+                file[name] = array
+    elif path.suffix == ".zarr":
+        group = zarr.open_group(path, mode="w")
+        for name, array in arrays.items():
+            group.create_array(name, data=np.asarray(array))
+    elif path.suffix == ".mat":
+        scipy.io.savemat(path, arrays)
+    elif path.suffix == ".csv":
+        pd.DataFrame(arrays).to_csv(path, index=False)
+    else:
+        pd.DataFrame(arrays).to_parquet(path, index=False)
+    return path
+
+
+def assert_same(left, right):
+    assert type(left) is type(right)
+    assert left.arrays().keys() == right.arrays().keys()
+    for name, array in left.arrays().items():
+        np.testing.assert_array_equal(array, right.arrays()[name])
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".h5", ".hdf5", ".nc", ".zarr", ".mat"])
+def test_channels_from_every_format(tmp_path, suffix):
+    arrays = channel_arrays()
+    data = read(save(tmp_path / f"channels{suffix}", arrays))
+    assert isinstance(data, ChannelData)
+    assert_same(data, ChannelData(**arrays))
+
+
+def test_matlab_without_trailing_axes_and_with_a_scalar(tmp_path):
+    arrays = channel_arrays() | {"noise_power": np.float64(0.5)}
+    arrays["channel"] = arrays["channel"][:, :, :1, :, :1]
+    arrays["subcarrier_frequency"] = np.zeros(1)
+    del arrays["rx_array"]
+    expected = ChannelData(**arrays)
+    arrays["channel"] = arrays["channel"][:, :, 0, 0, 0]
+    data = read(save(tmp_path / "channels.mat", arrays))
+    assert_same(data, expected)
+    assert data.noise_power.shape == ()
+
+
+def test_matlab_7_3_is_read_in_matlab_order(tmp_path):
+    arrays = channel_arrays()
+    path = tmp_path / "channels.mat"
+    with h5py.File(path, "w", userblock_size=512) as file:
+        for name, array in arrays.items():
+            stored = np.atleast_2d(array).T if array.ndim < 2 else array.T
+            if np.iscomplexobj(stored):
+                pair = np.empty(stored.shape, [("real", float), ("imag", float)])
+                pair["real"], pair["imag"] = stored.real, stored.imag
+                stored = pair
+            file[name] = stored
+            file[name].attrs["MATLAB_class"] = np.bytes_("double")
+    header = b"MATLAB 7.3 MAT-file".ljust(124) + b"\x00\x02IM"
+    with path.open("r+b") as file:
+        file.write(header)
+    assert_same(read(path), ChannelData(**arrays))
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".nc"])
+@pytest.mark.parametrize("kind", ["channel", "power"])
+def test_written_channels_and_powers_come_back(tmp_path, suffix, kind):
+    data = ChannelData(**channel_arrays()) if kind == "channel" else PowerData(**power_arrays())
+    write(tmp_path / f"data{suffix}", data)
+    assert_same(read(tmp_path / f"data{suffix}"), data)
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet"])
+def test_written_logs_and_labels_come_back(tmp_path, suffix):
+    log = read(save(tmp_path / f"log{suffix}", log_columns()))
+    assert isinstance(log, NetworkLog)
+    assert log.buffer.shape == (10, 2)
+    write(tmp_path / f"again{suffix}", log)
+    assert_same(read(tmp_path / f"again{suffix}"), log)
+    labels = Labels(
+        x=np.arange(8.0).reshape(4, 2), y=[1, 2, 0, 0], labelled=[1, 1, 0, 0], prediction=[1, 2, 3, 4]
+    )
+    write(tmp_path / f"labels{suffix}", labels)
+    assert_same(read(tmp_path / f"labels{suffix}"), labels)
+
+
+def test_power_in_decibels_is_linear_inside(tmp_path):
+    arrays = power_arrays()
+    decibels = 10 * np.log10(arrays.pop("power") / 1e-3)
+    data = read(save(tmp_path / "p.npz", arrays | {"power_db": decibels, "power_reference": 1e-3}))
+    assert isinstance(data, PowerData)
+    np.testing.assert_allclose(data.power, power_arrays()["power"], rtol=1e-12)
+
+
+def test_labels_mark_what_is_missing(tmp_path):
+    path = save(tmp_path / "labels.csv", {"x": [0.0, 1.0, 2.0], "y": [5.0, np.nan, 7.0]})
+    labels = read(path)
+    assert isinstance(labels, Labels)
+    np.testing.assert_array_equal(labels.labelled, [True, False, True])
+    np.testing.assert_array_equal(labels.y, [5.0, 0.0, 7.0])
+    assert labels.x.shape == (3, 1)
+
+
+def test_log_rows_are_sorted(tmp_path):
+    frame = pd.DataFrame(log_columns())
+    shuffled = frame.sample(frac=1, random_state=0)
+    assert_same(
+        read(save(tmp_path / "a.csv", dict(shuffled))),
+        read(save(tmp_path / "b.csv", dict(frame))),
+    )
+
+
+def test_other_columns_are_a_table(tmp_path):
+    path = save(tmp_path / "segments.csv", {"length": [1.0, 2.0], "segment": ["a", "b"]})
+    table = read(path)
+    assert isinstance(table, Table)
+    assert table.columns["segment"].tolist() == ["a", "b"]
+    assert read_table(save(tmp_path / "c.npz", channel_arrays())).columns["repeat"].tolist() == [0, 0, 1, 1]
+
+
+def test_arrays_are_read_only_and_the_given_ones_stay_writable():
+    arrays = channel_arrays()
+    data = ChannelData(**arrays)
+    with pytest.raises(ValueError, match="read-only"):
+        data.channel[0] = 0
+    arrays["channel"][0] = 0
+
+
+class Bomb:
+    """Leaves a trace when a pickle of it is loaded."""
+
+    def __reduce__(self):
+        return (exec, ("raise SystemExit('a pickle was loaded')",))
+
+
+def test_no_pickle_is_ever_loaded(tmp_path):
+    np.savez(tmp_path / "evil.npz", channel=np.array([Bomb()], dtype=object), allow_pickle=True)
+    (tmp_path / "plain.npz").write_bytes(pickle.dumps(Bomb()))
+    array = tmp_path / "evil.zarr" / "channel"
+    array.mkdir(parents=True)
+    (tmp_path / "evil.zarr" / ".zgroup").write_text('{"zarr_format": 2}')
+    (array / ".zarray").write_text(
+        json.dumps(
+            {
+                "zarr_format": 2, "shape": [1], "chunks": [1], "dtype": "|O", "compressor": None,
+                "fill_value": None, "order": "C", "filters": [{"id": "pickle", "protocol": 5}],
+            }
+        )
+    )  # fmt: skip
+    (array / "0").write_bytes(pickle.dumps(Bomb()))
+    for name in ("evil.npz", "plain.npz", "evil.zarr"):
+        with pytest.raises(InputError) as caught:
+            read(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"evil\.npz: expected plain arrays, got Python objects"):
+        read(tmp_path / "evil.npz")
+    with pytest.raises(InputError, match=r"evil\.zarr: expected plain arrays, got Python objects"):
+        read(tmp_path / "evil.zarr")
+
+
+def nan_at(array: np.ndarray, index: tuple[int, ...], value: float) -> np.ndarray:
+    array = array.copy()
+    array[index] = value
+    return array
+
+
+BAD_CHANNELS = {
+    "nan": (
+        lambda a: {"channel": nan_at(a["channel"], (1, 0, 1, 0, 2), np.nan)},
+        r"channel: expected finite numbers, got NaN at index \(1, 0, 1, 0, 2\)",
+    ),
+    "infinity": (
+        lambda a: {"rx_position": nan_at(a["rx_position"], (2, 1), np.inf)},
+        r"rx_position: expected finite numbers, got infinity at index \(2, 1\)",
+    ),
+    "positions of other links": (
+        lambda a: {"rx_position": a["rx_position"][:2]},
+        r"rx_position: expected shape \(link=3, 3\), got \(2, 3\)",
+    ),
+    "rank": (
+        lambda a: {"channel": a["channel"][0]},
+        r"channel: expected shape \(link, snapshot, rx_antenna, tx_antenna, subcarrier\), got \(4, 2, 1, 5\)",
+    ),
+    "unknown": (
+        lambda a: {"rx_positions": a["rx_position"]},
+        r"got 'rx_positions'\. Did you mean 'rx_position'\?",
+    ),
+    "noise zero": (
+        lambda a: {"noise_power": np.array([0.1, 0.0, 0.1])},
+        "noise_power: expected values above 0, got 0",
+    ),
+    "noise negative": (
+        lambda a: {"noise_power": np.float64(-2)},
+        "noise_power: expected values above 0, got -2",
+    ),
+    "repeat not whole": (lambda a: {"repeat": np.full(4, 0.5)}, "repeat: expected integer numbers"),
+    "repeat length": (
+        lambda a: {"repeat": np.zeros(3, int)},
+        r"repeat: expected shape \(snapshot=4,\), got \(3,\)",
+    ),
+    "array of other antennas": (
+        lambda a: {"rx_array": np.zeros((3, 3))},
+        r"rx_array: expected shape \(rx_antenna=2, 3\), got \(3, 3\)",
+    ),
+    "no array": (lambda a: {"rx_array": None}, r"rx_array: expected the positions of 2 elements"),
+    "no channel": (lambda a: {"channel": None}, "channel: expected an array of shape .* got nothing"),
+    "text": (
+        lambda a: {"snapshot_time": np.array(["a"] * 4)},
+        "snapshot_time: expected real numbers, got values",
+    ),
+    "complex positions": (
+        lambda a: {"tx_position": a["tx_position"] * 1j},
+        "tx_position: expected real numbers",
+    ),
+    "empty": (lambda a: {"channel": a["channel"][:0]}, "channel: expected at least one link"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_CHANNELS)
+def test_bad_channels_are_named(tmp_path, case):
+    change, message = BAD_CHANNELS[case]
+    arrays = channel_arrays()
+    arrays |= change(arrays)
+    path = save(tmp_path / "bad.npz", {name: array for name, array in arrays.items() if array is not None})
+    with pytest.raises(InputError, match=message) as caught:
+        read(path)
+    assert str(caught.value).startswith("bad.npz: ")
+    assert "\n" not in str(caught.value)
+
+
+BAD_COLUMNS = {
+    "missing column": (lambda c: {"ack_1": None}, "ack_1: expected a column, got nothing"),
+    "unknown column": (lambda c: {"bufer_0": c["slot"]}, r"got 'bufer_0'\. Did you mean 'buffer_0'\?"),
+    "no slot": (lambda c: {"slot": None}, "slot: expected a column"),
+    "action": (lambda c: {"action_0": c["slot"]}, "action: expected 0 or 1, got 4"),
+    "slot twice": (lambda c: {"slot": c["slot"] * 0}, "slot: expected each slot of an episode once"),
+    "negative": (lambda c: {"buffer_0": -1 - c["slot"]}, "buffer: expected values from 0 up, got -5"),
+    "fraction": (lambda c: {"buffer_0": c["slot"] / 3}, "buffer: expected integer numbers"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_COLUMNS)
+def test_bad_logs_are_named(tmp_path, case):
+    change, message = BAD_COLUMNS[case]
+    columns = log_columns()
+    columns |= change(columns)
+    path = save(
+        tmp_path / "log.csv", {name: column for name, column in columns.items() if column is not None}
+    )
+    with pytest.raises(InputError, match=message):
+        read(path)
+
+
+def test_bad_powers_and_labels_are_named(tmp_path):
+    arrays = power_arrays()
+    with pytest.raises(InputError, match="power_reference: expected a value beside power_db"):
+        read(save(tmp_path / "a.npz", {"power_db": arrays["power"], "rx_position": arrays["rx_position"]}))
+    with pytest.raises(InputError, match="power: expected values from 0 up"):
+        PowerData(**(arrays | {"power": -arrays["power"]}))
+    with pytest.raises(InputError, match="y: expected at least one label"):
+        read(save(tmp_path / "b.npz", {"x": np.zeros(2), "y": np.full(2, np.nan)}))
+    with pytest.raises(InputError, match="x: expected finite numbers, got NaN"):
+        read(save(tmp_path / "c.npz", {"x": np.array([0, np.nan]), "y": np.zeros(2)}))
+
+
+def test_bad_files_are_named(tmp_path):
+    with pytest.raises(InputError, match="expected a data file, got no such file"):
+        read(tmp_path / "none.npz")
+    (tmp_path / "a.pkl").write_bytes(b"")
+    with pytest.raises(InputError, match=r"got the suffix '\.pkl'"):
+        read(tmp_path / "a.pkl")
+    for name in ("broken.h5", "broken.mat", "broken.parquet", "broken.npz"):
+        (tmp_path / name).write_bytes(b"\x00\x01 not what the suffix says")
+        with pytest.raises(InputError) as caught:
+            read(tmp_path / name)
+        assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match=r"expected the suffix \.npz or \.nc"):
+        write(tmp_path / "a.csv", PowerData(**power_arrays()))
