@@ -1,0 +1,143 @@
+"""The fit of the base model that a diagnosis starts from."""
+
+from __future__ import annotations
+
+import jax
+import numpy as np
+
+from dtprob.errors import InputError
+from dtprob.gap import fit as fitting
+from dtprob.gap.problem import Problem
+
+_PRIOR_DRAWS = 64
+_ANGLES = 8
+_GRID = 121
+_REACH = 3.0
+_ROUNDS = 5
+_PEAKS = 3
+_MOST = 24
+_SHORT = 4
+_LONG = 3
+_COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
+
+
+def fit_base(problem: Problem, key: jax.Array, starts: int = 4) -> fitting.Fit:
+    """Posterior mode of the model without effects, the best of several starts.
+
+    Args:
+        problem: the model on its data.
+        key: for prior draws.
+        starts: the centre of the prior and this many less one draws from it.
+
+    Raises:
+        InputError: the model has no finite likelihood from any start.
+    """
+    draws = problem.prior_draws(key, _PRIOR_DRAWS)
+    fits = []
+    for x in [np.median(draws, axis=0), *draws[: starts - 1]]:
+        fitted = fitting.fit(problem, _sweep_angles(problem, x))
+        if np.isfinite(fitted.log_posterior):
+            fits.append(fitted)
+        if len(fits) >= 2 and _agree(fits):
+            break
+    if not fits:
+        raise InputError(
+            f"base model {problem.declaration.name}",
+            "a finite likelihood somewhere under its prior",
+            "none from any start",
+            "Check the units of the data and the priors of the model; dtprob.testing.check_model names what breaks.",
+        )
+    return polish(problem, max(fits, key=lambda f: f.log_posterior))
+
+
+def polish(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
+    """Leave local optima: refit from the other peaks along each global nuisance until none is better.
+
+    Args:
+        problem: the model on its data.
+        fitted: a mode.
+    """
+    scale = problem.prior_draws(jax.random.key(0), _PRIOR_DRAWS).std(axis=0)
+    for _ in range(_ROUNDS):
+        spread = next(iter(fitted.spread.values()), 0.1)
+        peaks = _other_peaks(problem, fitted.x, scale)
+        short = [fitting.fit(problem, x, fitted.effects, spread=spread, steps=_SHORT) for x in peaks]
+        short.sort(key=lambda f: -f.log_posterior)
+        long = [fitting.fit(problem, f.x, fitted.effects, spread=spread) for f in short[:_LONG]]
+        best = max(long, key=lambda f: f.log_posterior, default=fitted)
+        if best.log_posterior < fitted.log_posterior + 0.1:
+            return fitted
+        fitted = best
+    return fitted
+
+
+def _other_peaks(problem: Problem, x: np.ndarray, scale: np.ndarray) -> list[np.ndarray]:
+    """The highest other peaks of the log posterior along each global nuisance, its companions moved along.
+
+    Companions are the entries at the same place of nuisances in the same plates, as a material's conductivity is of its
+    permittivity.
+    """
+    found: list[tuple[float, np.ndarray]] = []
+    offsets = np.linspace(-_REACH, _REACH, _GRID)
+    blocks = [b for b in problem.blocks_of(None) if not b.local]
+    for block in blocks:
+        plates = problem.declaration.sites[block.name].plates
+        others = [
+            b
+            for b in blocks
+            if b is not block and plates and problem.declaration.sites[b.name].plates == plates
+        ]
+        for j, position in enumerate(block.index[0]):
+            lines = []
+            for shift in _COMPANION if others else (0.0,):
+                line = np.repeat(x[None], _GRID, axis=0)
+                line[:, position] += offsets * scale[position]
+                for other in others:
+                    if other.size == block.size:
+                        line[:, other.index[0][j]] += shift * scale[other.index[0][j]]
+                lines.append(line)
+            values = problem.profile(np.concatenate(lines)).reshape(len(lines), _GRID)
+            found += _peaks(np.where(np.isfinite(values), values, -np.inf), np.stack(lines))
+    return [point for _, point in sorted(found, key=lambda f: -f[0])[:_MOST]]
+
+
+def _peaks(values: np.ndarray, lines: np.ndarray) -> list[tuple[float, np.ndarray]]:
+    """The highest inner peaks, away from the middle, of the best line over companions."""
+    best = values.max(axis=0)
+    if np.ptp(best[np.isfinite(best)]) < 1.0:
+        return []
+    padded = np.concatenate([[-np.inf], best, [-np.inf]])
+    peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+    middle = _GRID // 2
+    others = [int(k) for k in peaks if abs(int(k) - middle) > 1]
+    near = sorted(others, key=lambda k: abs(k - middle))[:_PEAKS]
+    others = sorted({*near, *sorted(others, key=lambda k: -best[k])[:_PEAKS]})
+    return [(float(best[k]), lines[int(values[:, k].argmax()), k]) for k in others]
+
+
+def _agree(fits: list[fitting.Fit]) -> bool:
+    """Whether the two best fits are one optimum."""
+    values = sorted(f.log_posterior for f in fits)
+    return abs(values[-1] - values[-2]) < 0.1
+
+
+def _sweep_angles(problem: Problem, x: np.ndarray) -> np.ndarray:
+    """Coordinate-wise search of cluster-local angles, all clusters at once, so that no cluster starts in a wrong basin."""
+    circular = {name for name, site in problem.declaration.latent.items() if site.is_circular}
+    blocks = [b for b in problem.blocks_of(None) if b.local and b.name in circular]
+    if not blocks:
+        return x
+    x = x.copy()
+    offsets = np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False)
+    for _ in range(2):
+        for block in blocks:
+            for j in range(block.size):
+                position = block.index[:, j]
+                trials = []
+                for offset in offsets:
+                    moved = x.copy()
+                    moved[position] += offset
+                    likelihood, _, local = problem.evaluate(moved)
+                    trials.append(np.asarray(likelihood) + np.asarray(local))
+                x[position] += offsets[np.argmax(np.stack(trials), axis=0)]
+    return x

@@ -1,0 +1,258 @@
+"""Turn the evidence of a diagnosis into its result: plain words, numbers of report.json, arrays of gap.nc."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import jax
+import numpy as np
+import xarray as xr
+
+from dtprob.gap import closed
+from dtprob.gap.diagnosis import Cause, Diagnosis
+from dtprob.gap.evidence import Evidence
+from dtprob.gap.settings import Settings
+from dtprob.inference.engine import AbstractEngine
+
+_DRAWS = 200
+
+
+def compose(
+    evidence: Evidence,
+    causes: tuple[Cause, ...],
+    verdict: str,
+    settings: Settings,
+    engine: AbstractEngine,
+    key: jax.Array,
+) -> Diagnosis:
+    """The diagnosis with all sections of the report."""
+    first = evidence.steps[0].view.screening
+    sections: dict[str, Any] = {
+        "where": _where(evidence),
+        "gap": _gap(evidence),
+        "unlisted": {
+            "p_value": evidence.after.site_p_value,
+            "sites": [s.site for s in evidence.after.sites if s.p_value <= settings.level / 2],
+        },
+        "next_measurement": _next_measurement(evidence, causes) if verdict == "UNDETERMINED" else None,
+        "detectable": [
+            {"effect": name, "size": size, "parameter": e.parameters[0].name, "unit": e.parameters[0].unit}
+            for name, size, e in zip(first.names, first.detectable, evidence.problem.effects, strict=True)
+            if np.isfinite(size)
+        ],
+        "screening": _screening(evidence),
+        "fit": _fit(evidence, jax.random.fold_in(key, 3)),
+        "provenance": {"engine": engine.name, "seed": _seed(key), "model": evidence.problem.declaration.name},
+    }
+    return Diagnosis(verdict, summary(verdict, causes, evidence), causes, sections, _maps(evidence))
+
+
+def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
+    """The verdict in one sentence."""
+    best = causes[0] if causes else None
+    name = " and ".join(best.effects) if best else ""
+    closed_part = ""
+    if best is not None and best.closed_fraction is not None:
+        c = best.closed_fraction
+        closed_part = (
+            f", which closes {100 * c.mean:.0f}% of the gap ({100 * c.low:.0f} to {100 * c.high:.0f}%)"
+        )
+    match verdict:
+        case "NO_GAP":
+            return "No gap was found between the twin and the data."
+        case "LISTED":
+            return f"The gap comes from {name}{closed_part}."
+        case "LISTED_WITH_REMAINDER":
+            return f"Most of the gap comes from {name}{closed_part}; something that no known effect explains is left."
+        case "UNLISTED":
+            sites = ", ".join(s.site for s in evidence.after.sites[:2] if s.p_value <= 0.01)
+            tail = f" It shows at {sites}." if sites else ""
+            return f"There is a gap, and none of the known effects explains it.{tail}"
+        case _:
+            if best is None:
+                return "There are signs of a gap, but the data cannot tell which effect causes it."
+            classes = " or ".join(" and ".join(c) for c in best.alias_class)
+            return (
+                f"There is a gap, but the data cannot tell {classes} apart."
+                if len(best.alias_class) > 1
+                else (f"There are signs of {name}, but held-out data do not confirm that it closes a gap.")
+            )
+
+
+def _where(evidence: Evidence) -> dict[str, Any]:
+    total = max(evidence.bracket[1] - float(evidence.held_before.log_likelihood.sum()), 1e-12)
+    excess = sum(c.excess for c in evidence.before.coordinates) or 1.0
+    accepted = {e.name: e for e in evidence.problem.effects if e.name in evidence.accepted}
+    own = {site for e in accepted.values() for site in e.sites}
+    closed_share = evidence.fraction.mean if evidence.fraction is not None else 0.0
+    sites = [
+        {
+            "site": s.site,
+            "p_value": s.p_value,
+            "share": max(min(s.gain / total, 1.0), closed_share if s.site in own else 0.0),
+        }
+        for s in evidence.before.sites
+    ]
+    return {
+        "sites": sorted(sites, key=lambda s: (-s["share"], s["p_value"])),
+        "coordinates": [
+            {
+                "axes": {c.axis: [c.low, c.high]},
+                "p_value": c.p_value,
+                "share": max(c.excess, 0.0) / max(excess, c.excess),
+            }
+            for c in evidence.before.coordinates
+        ],
+    }
+
+
+def _gap(evidence: Evidence) -> dict[str, Any]:
+    n = evidence.problem.n_observation
+    best = evidence.bracket[1]
+    before = (best - float(evidence.held_before.log_likelihood.sum())) / n
+    after = (best - float(evidence.held_after.log_likelihood.sum())) / n if evidence.accepted else None
+    terms: dict[str, Any] = {}
+    error = closed.nmse_db(evidence.held_before)
+    if error is not None:
+        name = f"{next(iter(evidence.problem.declaration.observed))}_nmse_db"
+        terms[name] = [error, closed.nmse_db(evidence.held_after) if evidence.accepted else None]
+    return {
+        "unit": "nats per observation",
+        "before": before,
+        "after": after,
+        "floor": [0.0, max((best - evidence.bracket[0]) / n, 0.0)],
+        "in_user_terms": terms,
+    }
+
+
+def _screening(evidence: Evidence) -> list[dict[str, Any]]:
+    first = evidence.steps[0].view.screening
+    effects = {e.name: e for e in evidence.problem.effects}
+    order = np.argsort(
+        first.adjusted + 1e-3 * (1 - np.clip(first.log_bayes_factor / 1e3, 0, 1)), kind="stable"
+    )
+    return [
+        {
+            "effect": first.names[i],
+            "sites": list(effects[first.names[i]].sites),
+            "kind": effects[first.names[i]].kind,
+            "z": first.z[i],
+            "p_value": first.p_value[i],
+            "adjusted_p_value": first.adjusted[i],
+            "absorbed_by": first.absorbed_by[i],
+        }
+        for i in map(int, order)
+    ]
+
+
+def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
+    problem, fitted = evidence.problem, evidence.base
+    names = {b.name for b in problem.blocks_of(None) if not b.local}
+    noise = np.asarray(jax.random.normal(key, (_DRAWS, len(fitted.global_index))))
+    root = np.linalg.cholesky(fitted.covariance) if len(fitted.global_index) else fitted.covariance
+    draws: dict[str, list[np.ndarray]] = {name: [] for name in names}
+    for step in noise:
+        x = fitted.x.copy()
+        x[fitted.global_index] += root @ step
+        for name, value in problem.sites(x).items():
+            if name in names:
+                draws[name].append(np.asarray(value).reshape(-1))
+    contraction = _contraction(evidence)
+    nuisances = []
+    for name in (n for n in problem.declaration.latent if n in names):
+        values = np.stack(draws[name])
+        for j in range(values.shape[1]):
+            low, high = np.quantile(values[:, j], [0.05, 0.95])
+            label = name if values.shape[1] == 1 else f"{name}[{j}]"
+            nuisances.append(
+                {
+                    "name": label,
+                    "mean": values[:, j].mean(),
+                    "low": low,
+                    "high": high,
+                    "contraction": contraction[name][j],
+                }
+            )
+    warnings = [] if fitted.converged else ["the fit of the base model had not converged"]
+    return {
+        "nuisances": nuisances,
+        "converged": fitted.converged,
+        "n_clusters": problem.n_cluster,
+        "n_observations": problem.n_observation,
+        "warnings": warnings,
+    }
+
+
+def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
+    """1 - posterior variance / prior variance of each global nuisance, in unconstrained coordinates."""
+    problem, fitted = evidence.problem, evidence.base
+    position = {int(i): j for j, i in enumerate(fitted.global_index)}
+    result = {}
+    for block in problem.blocks_of(None):
+        if block.local:
+            continue
+        directions = np.zeros((block.size, problem.dimension))
+        directions[np.arange(block.size), block.index[0]] = 1.0
+        precision = np.einsum(
+            "ki,ki->k", np.asarray(problem.prior_curvature(fitted.x, directions)), directions
+        )
+        variance = np.array([fitted.covariance[position[int(i)], position[int(i)]] for i in block.index[0]])
+        size = problem.declaration.sites[block.name].size
+        change = np.clip(1 - variance * np.maximum(precision, 0.0), 0.0, 1.0)
+        result[block.name] = change if len(change) == size else np.full(size, change.mean())
+    return result
+
+
+def _next_measurement(evidence: Evidence, causes: tuple[Cause, ...]) -> dict[str, Any] | None:
+    """The cluster where repeating the measurement tells the two best explanations apart soonest."""
+    if not causes or len(causes[0].alias_class) < 2:
+        return None
+    step = next(s for s in reversed(evidence.steps) if s.accepted is not None)
+    first, second = (c[-1] for c in causes[0].alias_class[:2])
+    a, b = (np.asarray(step.problem.residual(step.trials[n].x)) for n in (first, second))
+    located = evidence.problem.rows.by_cluster(evidence.problem.rows.located) == 1
+    gain = 0.5 * np.where(located, (a - b) ** 2, 0.0).sum(1)
+    best = int(np.argmax(gain))
+    return {
+        "split": [list(c) for c in causes[0].alias_class[:2]],
+        "design": {evidence.problem.cluster_name: best},
+        "gain_nats": float(gain[best]),
+        "repeats": int(np.ceil(3.0 / max(float(gain[best]), 1e-3))),
+    }
+
+
+def _maps(evidence: Evidence) -> dict[str, xr.Dataset]:
+    where = {f"gap_{axis}": (axis, values) for axis, values in evidence.before.axes.items()}
+    after = {f"gap_after_{axis}": (axis, values) for axis, values in evidence.after.axes.items()}
+    problem, name = evidence.problem, evidence.problem.cluster_name
+    per = (
+        np.maximum((problem.rows.by_cluster(problem.rows.located) >= 0).sum(1), 1)
+        / problem.rows_per_observation
+    )
+    entropy = -evidence.bracket[1] / problem.n_observation
+    clusters: dict[str, Any] = {
+        "before": (name, -evidence.held_before.log_likelihood / per - entropy),
+        "after": (name, -evidence.held_after.log_likelihood / per - entropy),
+    }
+    for entry in problem.data.values():
+        for position in ("rx_position", "tx_position"):
+            if hasattr(entry, position) and len(getattr(entry, position)) == problem.n_cluster:
+                clusters[position] = ((name, "direction"), np.asarray(getattr(entry, position)))
+    first = evidence.steps[0].view.screening
+    screening = xr.Dataset(
+        {
+            "z": ("effect", first.z),
+            "p_value": ("effect", first.p_value),
+            "adjusted_p_value": ("effect", first.adjusted),
+            "log_bayes_factor": ("effect", first.log_bayes_factor),
+            "correlation": (("effect", "other_effect"), first.correlation),
+        },
+        coords={"effect": list(first.names), "other_effect": list(first.names)},
+    )
+    group = "links" if name == "link" else "clusters"
+    return {"where": xr.Dataset({**where, **after}), group: xr.Dataset(clusters), "screening": screening}
+
+
+def _seed(key: jax.Array) -> int:
+    return int(np.asarray(jax.random.key_data(key)).reshape(-1)[-1])

@@ -1,0 +1,148 @@
+"""Diagnose the gap between a model and data: which effect, where, how far, or none of the known ones."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import jax
+import numpy as np
+
+from dtprob.effects.effect import Effect
+from dtprob.errors import InputError
+from dtprob.gap import closed
+from dtprob.gap.base import fit_base
+from dtprob.gap.compose import compose
+from dtprob.gap.confirm import confirm
+from dtprob.gap.diagnosis import Cause, Diagnosis
+from dtprob.gap.evidence import Evidence
+from dtprob.gap.problem import Problem
+from dtprob.gap.search import Say, alarmed, search
+from dtprob.gap.settings import Settings
+from dtprob.inference.engine import AbstractEngine
+from dtprob.inference.posterior import Posterior
+from dtprob.models.declaration import Data, Model
+
+
+def diagnose(
+    model: Model,
+    data: Data,
+    effects: Sequence[Effect],
+    *,
+    key: jax.Array,
+    engine: AbstractEngine,
+    cluster: str | None = None,
+    settings: Settings = Settings(),
+    reference: Posterior | None = None,
+    say: Say = lambda text: None,
+) -> Diagnosis:
+    """Find out why data differ from a model.
+
+    Args:
+        model: the base model, any NumPyro function with named deterministic sites.
+        data: its arguments by name.
+        effects: the candidates; those that name a site the model lacks are an error.
+        key: typed JAX key; the verdict does not depend on it beyond the declared error rates.
+        engine: the engine that confirms the accepted causes and gives their sizes.
+        cluster: axis or data column whose values are independent of one another; by default the model's own.
+        settings: levels and effort.
+        reference: posterior of the model on earlier data; it becomes the prior of the nuisances, so that a change of a
+            parameter is a gap and not absorbed by a new fit.
+        say: receives one line at each stage, for progress.
+
+    Raises:
+        InputError: no effects, effects on absent sites, fewer than four clusters, or a base model that does not fit.
+    """
+    if not effects:
+        raise InputError(
+            "effects", "at least one candidate", "none", "Pass effects that act on the model's sites."
+        )
+    problem = Problem(model, data, effects, cluster, reference)
+    if problem.n_cluster < 4:
+        raise InputError(
+            "clusters",
+            "at least 4 independent ones",
+            f"{problem.n_cluster} along {problem.cluster_name!r}",
+            "Give more links, episodes or segments, or another cluster axis.",
+        )
+    evidence = _gather(problem, key, settings, say)
+    causes = _causes(evidence, jax.random.fold_in(key, 7), engine, settings, say)
+    verdict = decide(evidence, causes, settings)
+    return compose(evidence, causes, verdict, settings, engine, key)
+
+
+def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
+    keys = jax.random.split(key, 4)
+    say(f"fitting the base model to {problem.n_cluster} clusters")
+    base = fit_base(problem, keys[0])
+    steps = search(problem, base, keys[1], settings, say)
+    last = steps[-1].view
+    say("judging on held-out clusters")
+    assignment = closed.folds(problem.n_cluster, keys[2], settings.folds)
+    held_before = closed.cross_fit(problem, base, assignment)
+    held_after = (
+        closed.cross_fit(last.problem, last.fitted, assignment) if last.fitted.effects else held_before
+    )
+    remains = last.location.site_p_value <= settings.level / 2
+    left = max((s.gain for s in last.location.sites), default=0.0) if remains else 0.0
+    bracket = closed.floor(last.problem, last.fitted, held_after, left)
+    fraction = (
+        closed.closed_fraction(held_before, held_after, bracket, keys[3]) if last.fitted.effects else None
+    )
+    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction)
+
+
+def _causes(
+    evidence: Evidence, key: jax.Array, engine: AbstractEngine, settings: Settings, say: Say
+) -> tuple[Cause, ...]:
+    if not evidence.accepted:
+        return ()
+    say(f"confirming {', '.join(evidence.accepted)} with {type(engine).__name__}")
+    effects = [e for e in evidence.problem.effects if e.name in evidence.accepted]
+    sizes, plausible = confirm(evidence.last.problem, evidence.fitted, effects, key, engine)
+    classes, probability = alternatives(evidence, settings)
+    first = evidence.held_after.estimates
+    strata = tuple(float(v) for v in next(iter(first.values()))[:, 0]) if first else ()
+    physics = "; ".join(e.physics for e in effects if e.physics)
+    return (
+        Cause(evidence.accepted, classes, probability, sizes, evidence.fraction, physics, strata, plausible),
+    )
+
+
+def alternatives(evidence: Evidence, settings: Settings) -> tuple[tuple[tuple[str, ...], ...], float]:
+    """Sets that differ from the accepted one in its last effect and that the data cannot rule out; its probability."""
+    step = next(s for s in reversed(evidence.steps) if s.accepted is not None)
+    names = list(step.trials)
+    evidences = np.array([step.trials[n].log_evidence for n in names])
+    weights = np.exp(evidences - evidences.max())
+    weights /= weights.sum()
+    order = np.argsort(-weights)
+    held = np.cumsum(weights[order])
+    count = int(np.searchsorted(held, settings.credibility)) + 1
+    classes = tuple((*step.view.fitted.effects, names[int(i)]) for i in order[:count])
+    return classes, float(weights[names.index(str(step.accepted))])
+
+
+def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) -> str:
+    """The verdict."""
+    level = settings.level / 2
+    if not alarmed(evidence.steps[0].view, settings) or _negligible(evidence, settings):
+        return "NO_GAP"
+    if not causes:
+        return "UNLISTED" if evidence.before.site_p_value <= level else "UNDETERMINED"
+    cause = causes[0]
+    remains = evidence.after.site_p_value <= level
+    if cause.closed_fraction is None:
+        return "UNLISTED" if remains else "UNDETERMINED"
+    if remains and cause.closed_fraction.mean < settings.relevance:
+        return "UNLISTED"
+    if cause.probability < settings.credibility:
+        return "UNDETERMINED"
+    return (
+        "LISTED_WITH_REMAINDER" if remains and cause.closed_fraction.mean < 1 - settings.minor else "LISTED"
+    )
+
+
+def _negligible(evidence: Evidence, settings: Settings) -> bool:
+    """Whether the base model's held-out error is already below what the user cares about."""
+    error = closed.nmse_db(evidence.held_before)
+    return settings.tolerance_db is not None and error is not None and error <= -abs(settings.tolerance_db)

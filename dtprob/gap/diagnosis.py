@@ -1,0 +1,109 @@
+"""The result of a diagnosis: what report.json and gap.nc hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dtprob.gap.closed import ClosedFraction
+
+
+@dataclass(frozen=True)
+class Size:
+    """Posterior of one scalar of an effect's parameter: mean and 90% interval in `unit`."""
+
+    name: str
+    mean: float
+    low: float
+    high: float
+    unit: str
+
+
+@dataclass(frozen=True)
+class Cause:
+    """A set of effects that explains the gap, with the sets that the data cannot tell from it.
+
+    Attributes:
+        effects: names.
+        alias_class: equally good sets, this one first.
+        probability: among the sets that were refitted.
+        size: posterior of each scalar parameter.
+        closed_fraction: on held-out clusters; None where not established.
+        physics: one line.
+        strata: the first parameter's estimate in each fold.
+        plausible: whether the size lies within what the effect's prior calls plausible.
+    """
+
+    effects: tuple[str, ...]
+    alias_class: tuple[tuple[str, ...], ...]
+    probability: float
+    size: tuple[Size, ...]
+    closed_fraction: ClosedFraction | None
+    physics: str
+    strata: tuple[float, ...]
+    plausible: bool
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """Verdict, causes, where, how far.
+
+    `sections` holds the remaining parts of the report, each as plain numbers and text; `maps` the arrays of gap.nc.
+    """
+
+    verdict: str
+    summary: str
+    causes: tuple[Cause, ...]
+    sections: Mapping[str, Any]
+    maps: Mapping[str, xr.Dataset]
+
+    def to_report(self) -> dict[str, Any]:
+        """The content of report.json."""
+        report = {
+            "verdict": self.verdict,
+            "summary": self.summary,
+            "causes": [_cause(cause) for cause in self.causes],
+            **self.sections,
+        }
+        return plain(report)
+
+    def to_datatree(self) -> xr.DataTree:
+        """The content of gap.nc: groups where, links or clusters, screening."""
+        return xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in self.maps.items()})
+
+
+def _cause(cause: Cause) -> dict[str, Any]:
+    closed = cause.closed_fraction
+    return {
+        "effects": list(cause.effects),
+        "alias_class": [list(names) for names in cause.alias_class],
+        "probability": cause.probability,
+        "size": {s.name: {"mean": s.mean, "low": s.low, "high": s.high, "unit": s.unit} for s in cause.size},
+        "closed_fraction": None
+        if closed is None
+        else {"mean": closed.mean, "low": closed.low, "high": closed.high},
+        "physics": cause.physics,
+        "strata": {"estimate": list(cause.strata)},
+        "plausible": cause.plausible,
+    }
+
+
+def plain(value: Any) -> Any:
+    """Numbers, text, lists and dicts only; what is not finite becomes null."""
+    if isinstance(value, Mapping):
+        return {str(k): plain(v) for k, v in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [plain(v) for v in value]
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    return value

@@ -1,0 +1,162 @@
+"""First-order directions of effects at a fit, without compiling the effects.
+
+The derivative of each rewrite in its parameters is taken at the values that the sites have; pushing these small arrays
+through the compiled model gives the effect's whitened tangents, and pulling site gradients back through a random field's
+rewrite gives the scores of a variance effect.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects.effect import Context, Effect
+from dtprob.gap import whiten
+from dtprob.gap.problem import Problem
+from dtprob.gap.programs import Programs, null_vector, unflatten
+from dtprob.gap.quick import quick_jit
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What effects see at a fit: data, values of the sites, parameters of the observed distributions."""
+
+    problem: Problem
+    x: np.ndarray
+    values: Mapping[str, jax.Array]
+    observations: Mapping[str, whiten.Observation]
+
+    def grown(self) -> dict[str, jax.Array]:
+        """Values of the sites, each in the largest shape that a candidate gives it."""
+        sizes = self.problem.float_sites
+        return {
+            n: jnp.broadcast_to(v, sizes[n].shape) if n in sizes else jnp.asarray(v)
+            for n, v in self.values.items()
+        }
+
+    @property
+    def context(self) -> Context:
+        """Data and sites by name."""
+        return Context(self.problem.data, self.values)
+
+
+@dataclass(frozen=True)
+class Extra:
+    """Rows that only a rewritten distribution has, such as a score of its tail.
+
+    Attributes:
+        site: the observed site.
+        shift: whitened shifts (row, parameter).
+        null: the rewritten distribution at the effect's null.
+        first: number of components that the base distribution has.
+    """
+
+    site: str
+    shift: np.ndarray
+    null: whiten.Observation
+    first: int
+
+    def score(self, values: jax.Array) -> np.ndarray:
+        """Scores (n, parameter) of observed values (n, ...)."""
+        shift = jnp.asarray(self.shift)
+
+        def one(value: jax.Array) -> jax.Array:
+            return whiten.residual(self.null, value)[self.first :].reshape(-1) @ shift
+
+        return np.asarray(quick_jit(lambda stacked: jax.lax.map(one, stacked))(values))
+
+
+@dataclass(frozen=True)
+class Tangents:
+    """Whitened tangents of mean effects.
+
+    Attributes:
+        effects: in the order of the columns.
+        groups: for each effect its columns.
+        columns: (cluster, row, column).
+        extra: rows beyond the base model's, by effect name.
+    """
+
+    effects: tuple[Effect, ...]
+    groups: tuple[np.ndarray, ...]
+    columns: jax.Array
+    extra: Mapping[str, tuple[Extra, ...]]
+
+
+def surroundings(problem: Problem, x: np.ndarray) -> Surroundings:
+    """Evaluate the sites and observed distributions at x."""
+    return Surroundings(problem, x, problem.sites(x), problem.around(problem.parameters(x)))
+
+
+def tangents(around: Surroundings, effects: Sequence[Effect], programs: Programs) -> Tangents:
+    """Whitened tangents of mean effects at their null."""
+    problem = around.problem
+    sizes = [e.dimension for e in effects]
+    groups = tuple(np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])) if effects else ()
+    deltas = (
+        {n: np.zeros((sum(sizes), *s.shape), s.dtype) for n, s in problem.float_sites.items()}
+        if effects
+        else {}
+    )
+    direct: list[tuple[np.ndarray, jax.Array]] = []
+    extra: dict[str, tuple[Extra, ...]] = {}
+    touched: set[str] = set()
+    found = programs.site_tangents(around.grown())
+    for effect, group in zip(effects, groups, strict=True):
+        for site in effect.rewrites:
+            if site in deltas:
+                tangent = np.moveaxis(np.asarray(found[effect.name][site]), -1, 0)
+                deltas[site][group] = np.stack([np.broadcast_to(t, deltas[site].shape[1:]) for t in tangent])
+                touched.add(site)
+        rows, own = _distribution_tangents(around, effect)
+        if rows is not None:
+            direct.append((group, rows))
+        extra[effect.name] = own
+    columns = jnp.zeros((*problem.rows.gather.shape, sum(sizes)))
+    if touched:
+        columns = problem.site_shift(around.x, {n: deltas[n] for n in touched})
+    for group, rows in direct:
+        columns = columns.at[..., group].add(rows)
+    return Tangents(tuple(effects), groups, columns, extra)
+
+
+def _distribution_tangents(
+    around: Surroundings, effect: Effect
+) -> tuple[jax.Array | None, tuple[Extra, ...]]:
+    """Shifts (cluster, row, parameter) of the base model's rows, and rows of its own, of a rewritten distribution."""
+    if not effect.distributions:
+        return None, ()
+    null, extra = null_vector(effect), []
+    base_rows: list[dict[str, jax.Array]] = [{} for _ in range(len(null))]
+    for site, observation in around.observations.items():
+        shape = (around.problem.components[site], *around.problem.declaration.sites[site].shape)
+        rewrite = effect.distributions.get(site)
+        if rewrite is None:
+            for rows in base_rows:
+                rows[site] = jnp.zeros(shape)
+            continue
+        value = jnp.zeros(shape[1:])
+
+        def parameters(flat: jax.Array, site: str = site, rewrite: Any = rewrite, value: Any = value) -> Any:
+            fn = rewrite(
+                whiten.distribution(around.observations[site]), unflatten(effect, flat), around.context
+            )
+            return whiten.observation(fn, value, site).parameters
+
+        new = whiten.observation(
+            rewrite(whiten.distribution(observation), effect.null(), around.context), value, site
+        )
+        shifts = []
+        for j, basis in enumerate(jnp.eye(len(null))):
+            shift = whiten.shift(new, jax.jvp(parameters, (null,), (basis,))[1])
+            base_rows[j][site] = shift[: shape[0]]
+            shifts.append(np.asarray(shift[shape[0] :]).reshape(-1))
+        if shifts[0].size:
+            extra.append(Extra(site, np.stack(shifts, axis=-1), new, shape[0]))
+    stacked = [around.problem.rows.stack(rows) for rows in base_rows]
+    return jnp.stack(stacked, axis=-1), tuple(extra)

@@ -1,0 +1,49 @@
+"""Everything that a verdict is drawn from."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from dtprob.gap.closed import ClosedFraction, HeldOut
+from dtprob.gap.fit import Fit
+from dtprob.gap.problem import Problem
+from dtprob.gap.search import Step, View
+from dtprob.gap.where import Location
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """The base fit, the steps of the search and the held-out losses before and after the accepted effects."""
+
+    problem: Problem
+    base: Fit
+    steps: tuple[Step, ...]
+    held_before: HeldOut
+    held_after: HeldOut
+    bracket: tuple[float, float]
+    fraction: ClosedFraction | None
+
+    @property
+    def before(self) -> Location:
+        """Maps at the base fit."""
+        return self.steps[0].view.location
+
+    @property
+    def last(self) -> View:
+        """The view with all accepted effects."""
+        return self.steps[-1].view
+
+    @property
+    def after(self) -> Location:
+        """Maps at the last fit."""
+        return self.last.location
+
+    @property
+    def fitted(self) -> Fit:
+        """The fit with all accepted effects."""
+        return self.last.fitted
+
+    @property
+    def accepted(self) -> tuple[str, ...]:
+        """Names of the accepted effects."""
+        return self.fitted.effects

@@ -1,0 +1,126 @@
+"""Coordinates of a fit: latent sites, effect parameters and random fields as one flat vector."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro.distributions import biject_to, constraints
+from numpyro.distributions.transforms import IdentityTransform
+
+from dtprob.models.declaration import base_constraint
+
+
+@dataclass(frozen=True)
+class Block:
+    """Coordinates that belong together.
+
+    Attributes:
+        name: the latent site, effect parameter or field.
+        owner: the effect's name; None for a nuisance of the base model.
+        shape: of the block's value.
+        index: positions in the flat vector, (cluster, size) if local to clusters, else (1, size).
+        local: whether each cluster has its own entries.
+    """
+
+    name: str
+    owner: str | None
+    shape: tuple[int, ...]
+    index: np.ndarray
+    local: bool
+
+    @property
+    def size(self) -> int:
+        """Entries per cluster, or in all if not local."""
+        return int(self.index.shape[1])
+
+    @property
+    def offset(self) -> int:
+        """Position of the first entry."""
+        return int(self.index.min()) if self.index.size else 0
+
+
+@dataclass(frozen=True)
+class Layout:
+    """All blocks of a flat vector."""
+
+    blocks: tuple[Block, ...]
+    dimension: int
+
+    def __getitem__(self, name: str) -> Block:
+        return next(b for b in self.blocks if b.name == name)
+
+    def part(self, x: Any, name: str) -> jax.Array:
+        """The value of one block."""
+        block = self[name]
+        size = int(np.prod(block.shape, dtype=int))
+        if size == 0:
+            return jnp.zeros(block.shape)
+        return jax.lax.dynamic_slice_in_dim(x, block.offset, size).reshape(block.shape)
+
+    def put(self, x: np.ndarray, name: str, value: Any) -> None:
+        """Write the value of one block into x."""
+        flat = np.asarray(value).reshape(-1)
+        x[self[name].offset : self[name].offset + flat.size] = flat
+
+    def copy_into(self, x: np.ndarray, source: Layout, values: np.ndarray) -> None:
+        """Write every block that another layout also has."""
+        theirs = {b.name: b for b in source.blocks}
+        for block in self.blocks:
+            other = theirs.get(block.name)
+            if other is not None and other.shape == block.shape and block.index.size:
+                x[block.index] = values[other.index]
+
+
+def make_layout(
+    entries: Iterable[tuple[str, str | None, tuple[int, ...], tuple[str, ...]]],
+    cluster: str | None,
+    n_cluster: int,
+) -> Layout:
+    """Lay out (name, owner, shape, axes) entries one after another."""
+    blocks: list[Block] = []
+    offset = 0
+    for name, owner, shape, axes in entries:
+        size = int(np.prod(shape, dtype=int))
+        index = offset + np.arange(size).reshape(shape)
+        axis = axes.index(cluster) if cluster in axes[: len(shape)] else None
+        local = axis is not None and shape[axis] == n_cluster
+        if local and axis is not None:
+            index = np.moveaxis(index, axis, 0)
+        blocks.append(Block(name, owner, shape, index.reshape(n_cluster if local else 1, -1), local))
+        offset += size
+    return Layout(tuple(blocks), offset)
+
+
+class _Wrap(IdentityTransform):
+    """Any real number to the angle in [-pi, pi) that it stands for; a density is -inf outside of its support."""
+
+    def __call__(self, x: Any) -> jax.Array:
+        return jnp.mod(x + jnp.pi, 2 * jnp.pi) - jnp.pi
+
+
+def transform_of(fn: Any) -> Any:
+    """Unconstrained to constrained values of a distribution; angles are coordinates without a cut, wrapped as values."""
+    if base_constraint(fn.support) is constraints.circular:
+        return _Wrap()
+    return biject_to(fn.support)
+
+
+def fold(jacobian: jax.Array, batch_shape: tuple[int, ...]) -> jax.Array:
+    """Sum a log Jacobian over event dimensions."""
+    extra = jnp.ndim(jacobian) - len(batch_shape)
+    return jnp.sum(jacobian, axis=tuple(range(-extra, 0))) if extra > 0 else jacobian
+
+
+def normal_of(draws: Mapping[str, np.ndarray]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Mean and precision of draws (draw, size) of each block."""
+    result = {}
+    for name, u in draws.items():
+        size = np.mean(u**2, axis=0)
+        floor = 1e-10 * np.where(size > 0, size, 1.0)  # in the unit of each entry
+        result[name] = (u.mean(0), np.linalg.inv(np.atleast_2d(np.cov(u.T)) + np.diag(floor)))
+    return result

@@ -1,0 +1,120 @@
+"""The compiled derivatives of all candidate effects at the sites."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects.effect import FIELD, Context, Effect
+from dtprob.gap.quick import quick_jit
+from dtprob.models.declaration import Data, split_static
+
+
+class Programs:
+    """The compiled derivatives of all candidates, shared by every fit of one diagnosis.
+
+    Sites come in the largest shape that any candidate gives them, so one compilation serves all fits.
+    """
+
+    def __init__(self, effects: Sequence[Effect], data: Data) -> None:
+        self._arrays, static = split_static(data)
+        means = [e for e in effects if e.kind == "mean" and e.rewrites]
+        fields = [e for e in effects if e.kind == "variance"]
+
+        @quick_jit
+        def tangents(values: Mapping[str, jax.Array], arrays: Any) -> dict[str, dict[str, jax.Array]]:
+            context = Context(eqx.combine(arrays, static), values)
+            return {e.name: {s: _derivative(e, s, values[s], context) for s in e.rewrites} for e in means}
+
+        @quick_jit
+        def energy(
+            values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], arrays: Any
+        ) -> dict[str, jax.Array]:
+            context = Context(eqx.combine(arrays, static), values)
+            return {e.name: _field_energy(e, values, gradients, context) for e in fields}
+
+        @quick_jit
+        def trials(
+            values: Mapping[str, jax.Array], sizes: Mapping[str, jax.Array], arrays: Any
+        ) -> dict[str, dict[str, jax.Array]]:
+            context = Context(eqx.combine(arrays, static), values)
+            return {
+                e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in means if e.name in sizes
+            }
+
+        self._tangents, self._energy, self._trials = tangents, energy, trials
+
+    def site_tangents(self, values: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
+        """For each mean effect and rewritten site the derivative (*site, parameter) at the null."""
+        return self._tangents(dict(values), self._arrays)
+
+    def trial_shifts(
+        self, values: Mapping[str, jax.Array], sizes: Mapping[str, np.ndarray]
+    ) -> dict[str, dict[str, jax.Array]]:
+        """For each named effect, its rewritten sites less their values (trial, *site) at flat parameters (trial, n)."""
+        return self._trials(dict(values), {n: jnp.asarray(v) for n, v in sizes.items()}, self._arrays)
+
+    def field_energy(
+        self, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array]
+    ) -> dict[str, np.ndarray]:
+        """Sum of squared field scores (n,) of each variance effect, from site gradients (n, *site)."""
+        found = self._energy(dict(values), dict(gradients), self._arrays)
+        return {name: np.asarray(value) for name, value in found.items()}
+
+
+def unflatten(effect: Effect, flat: jax.Array) -> dict[str, jax.Array]:
+    """Parameters by name from one flat vector."""
+    result, low = {}, 0
+    for parameter in effect.parameters:
+        size = int(np.prod(parameter.shape, dtype=int))
+        result[parameter.name] = flat[low : low + size].reshape(parameter.shape)
+        low += size
+    return result
+
+
+def null_vector(effect: Effect) -> jax.Array:
+    """The null of all parameters as one flat vector."""
+    return jnp.concatenate([jnp.full(p.shape, p.null).reshape(-1) for p in effect.parameters])
+
+
+def _derivative(effect: Effect, site: str, value: jax.Array, context: Context) -> jax.Array:
+    def moved(flat: jax.Array) -> jax.Array:
+        return jnp.asarray(effect.rewrites[site](value, unflatten(effect, flat), context)).astype(value.dtype)
+
+    return jax.jacfwd(moved)(null_vector(effect))
+
+
+def _trial_shifts(
+    effect: Effect, values: Mapping[str, jax.Array], context: Context, sizes: jax.Array
+) -> dict[str, jax.Array]:
+    def one(flat: jax.Array) -> dict[str, jax.Array]:
+        parameters, result = unflatten(effect, flat), {}
+        for site, rewrite in effect.rewrites.items():
+            new = jnp.asarray(rewrite(values[site], parameters, context)).astype(values[site].dtype)
+            result[site] = new - values[site]
+        return result
+
+    return jax.vmap(one)(sizes)
+
+
+def _field_energy(
+    effect: Effect, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], context: Context
+) -> jax.Array:
+    shape = effect.shape_of_field(values[effect.sites[0]], context)
+    unit = {p.name: jnp.ones(p.shape) for p in effect.parameters}
+    sites = [site for site in effect.rewrites if site in gradients]
+
+    def moved(field: jax.Array) -> dict[str, jax.Array]:
+        result = {}
+        for site in sites:
+            new = jnp.asarray(effect.rewrites[site](values[site], {**unit, FIELD: field}, context))
+            result[site] = jnp.broadcast_to(new.astype(values[site].dtype), gradients[site].shape[1:])
+        return result
+
+    _, pull = jax.vjp(moved, jnp.zeros(shape))
+    return jax.lax.map(lambda g: jnp.sum(pull(g)[0] ** 2), {site: gradients[site] for site in sites})

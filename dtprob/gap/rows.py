@@ -1,0 +1,113 @@
+"""Whitened rows of all observations, sorted by cluster."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.errors import InputError
+from dtprob.models.declaration import Data, Declaration, Site
+
+
+@dataclass(frozen=True)
+class Rows:
+    """Where each whitened row belongs.
+
+    Attributes:
+        ids: cluster of every row.
+        coordinates: position of every row along each named axis, -1 where it has none.
+        located: 1 for rows that stand for a location or probability, 0 for a spread.
+        gather: (cluster, row) positions of each cluster's rows; the position after the last stands for padding.
+        cluster_name: the axis or column of the clusters.
+    """
+
+    ids: np.ndarray
+    coordinates: Mapping[str, np.ndarray]
+    located: np.ndarray
+    gather: np.ndarray
+    cluster_name: str
+
+    @property
+    def n_cluster(self) -> int:
+        """Number of clusters."""
+        return int(self.gather.shape[0])
+
+    def stack(self, rows: Mapping[str, jax.Array]) -> jax.Array:
+        """Rows of all observed sites, (component, *site) each, as (cluster, row), padded with zeros."""
+        flat = jnp.concatenate([*(value.reshape(-1) for value in rows.values()), jnp.zeros(1)])
+        return flat[self.gather]
+
+    def by_cluster(self, values: np.ndarray) -> np.ndarray:
+        """A flat per-row array as (cluster, row), padded with -1."""
+        return np.concatenate([values, [-1]])[self.gather]
+
+
+def make_rows(
+    declaration: Declaration,
+    shapes: Mapping[str, tuple[int, ...]],
+    located: Mapping[str, int],
+    data: Data,
+    column: str | None,
+) -> Rows:
+    """Index the rows of every observed site.
+
+    Args:
+        declaration: the model's sites.
+        shapes: (component, *site shape) of each observed site's rows.
+        located: how many components of each stand for its location.
+        data: holds the cluster column, if one is named.
+        column: a data entry whose values name the clusters; None for the declaration's axis.
+    """
+    axes = sorted({axis for name in shapes for axis in declaration.sites[name].axes})
+    coordinates: dict[str, list[np.ndarray]] = {axis: [] for axis in axes}
+    ids, marks = [], []
+    labels = None if column is None else _labels(np.asarray(data[column]))
+    for name, shape in shapes.items():
+        site, grid = declaration.sites[name], np.indices(shape)
+        for axis in axes:
+            index = grid[1 + site.axes.index(axis)] if axis in site.axes else np.full(shape, -1)
+            coordinates[axis].append(index.reshape(-1))
+        ids.append(_cluster_of(declaration, site, grid[1:], labels, column).reshape(-1))
+        marks.append((grid[0] < located[name]).reshape(-1))
+    found = np.concatenate(ids)
+    name = column or declaration.cluster or "row"
+    joined = {axis: np.concatenate(parts) for axis, parts in coordinates.items()}
+    return Rows(found, joined, np.concatenate(marks).astype(int), _gather_index(found), name)
+
+
+def _labels(column: np.ndarray) -> np.ndarray:
+    """A cluster number for each entry; their own order if all differ, so that local coordinates keep theirs."""
+    names, labels = np.unique(column, return_inverse=True)
+    return np.arange(len(column)) if len(names) == len(column) else labels
+
+
+def _cluster_of(
+    declaration: Declaration, site: Site, grid: np.ndarray, labels: np.ndarray | None, column: str | None
+) -> np.ndarray:
+    if labels is not None:
+        matching = [i for i, n in enumerate(site.shape) if n == len(labels)]
+        if matching:
+            return labels[grid[matching[0]]]
+    elif declaration.cluster in site.axes:
+        return grid[site.axes.index(str(declaration.cluster))]
+    elif declaration.cluster is None and site.shape:
+        return grid[0]
+    raise InputError(
+        "cluster",
+        f"an axis of {site.name!r} ({', '.join(site.axes)}) or a column as long as one",
+        repr(column or declaration.cluster),
+        "Name the axis or column whose values are independent of one another",
+    )
+
+
+def _gather_index(ids: np.ndarray) -> np.ndarray:
+    order, counts = np.argsort(ids, kind="stable"), np.bincount(ids)
+    index = np.full((len(counts), int(counts.max())), len(ids))
+    starts = np.concatenate([[0], np.cumsum(counts)[:-1]])
+    for c, (start, count) in enumerate(zip(starts, counts, strict=True)):
+        index[c, :count] = order[start : start + count]
+    return index

@@ -1,0 +1,357 @@
+"""Which effect: nuisance-adjusted scores of all candidates at once, with a bootstrapped family-wise threshold.
+
+Source: Neyman's C(alpha) score, u = sum_i (s_i - B r_i) with variance J = I_ee - B I_te (Bera & Yoon 1993); variance
+effects by the second-order score of a random field (one-sided); significance by the parametric bootstrap of the smallest
+p-value over all candidates (Westfall & Young's min-p).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import special, stats
+
+from dtprob.effects.effect import Effect
+from dtprob.gap import fit as fitting
+from dtprob.gap.directions import Tangents, surroundings, tangents
+from dtprob.gap.problem import Problem
+from dtprob.gap.settings import Settings
+
+_ABSORBED = 0.98
+_SEEN = 25.0
+_NOTHING = 1e-9
+_LOG_SMALLEST = -660.0
+
+
+@dataclass(frozen=True)
+class Screening:
+    """Scores of all candidates at one fit.
+
+    Attributes:
+        names: the candidates.
+        z: signed scores for one parameter, otherwise the normal quantile of the chi-square p-value.
+        p_value: of each candidate alone.
+        adjusted: family-wise p-value over all candidates.
+        log_bayes_factor: of adding the candidate, from (u, J) and its prior.
+        step: one-step estimate of each mean effect's parameters, flat.
+        absorbed_by: the nuisance that hides the candidate, if one does.
+        detectable: size along the best-determined direction that would be noticed nine times in ten.
+        correlation: of the candidates' scores after adjustment; aliases are near +-1.
+        replicate_p: smallest p-value over all candidates in each bootstrap replicate.
+    """
+
+    names: tuple[str, ...]
+    z: np.ndarray
+    p_value: np.ndarray
+    adjusted: np.ndarray
+    log_bayes_factor: np.ndarray
+    step: dict[str, np.ndarray]
+    absorbed_by: tuple[str | None, ...]
+    detectable: np.ndarray
+    correlation: np.ndarray
+    replicate_p: np.ndarray
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Whitened tangents of the fitted nuisances, and what removes them from rows and from columns."""
+
+    columns: jax.Array
+    local_columns: jax.Array
+    local_inverse: jax.Array
+    global_inverse: jax.Array
+    reduced: jax.Array
+
+    def rows(self, e: jax.Array) -> jax.Array:
+        """Rows (..., cluster, row) after the linearised refit of all nuisances."""
+        score = jnp.einsum("cmg,...cm->...g", self.reduced, e)
+        e = e - jnp.einsum("cmg,gh,...h->...cm", self.columns, self.global_inverse, score)
+        local = jnp.einsum("cml,...cm->...cl", self.local_columns, e)
+        return e - jnp.einsum("cml,clk,...ck->...cm", self.local_columns, self.local_inverse, local)
+
+    def adjust(self, w: jax.Array) -> tuple[jax.Array, jax.Array]:
+        """Effect columns (cluster, row, k) after projection, and B's part that falls on the global nuisances."""
+        local = jnp.einsum("cml,cmk->clk", self.local_columns, w)
+        w = w - jnp.einsum("cml,cli,cik->cmk", self.local_columns, self.local_inverse, local)
+        cross = jnp.einsum("cmg,cmk->gk", self.reduced, w)
+        coefficients = self.global_inverse @ cross
+        return w - jnp.einsum("cmg,gk->cmk", self.reduced, coefficients), coefficients
+
+
+def project(problem: Problem, fitted: fitting.Fit) -> Projection:
+    """Projection on the complement of everything that the fit is free to move."""
+    active = fitting.activate(problem, fitted.effects)
+    directions = fitting.basis(problem, active)
+    n = len(active.global_index)
+    w = problem.columns(fitted.x, directions)
+    hessian = np.asarray(problem.prior_curvature(fitted.x, directions))
+    _, _, effect_curvature = fitting.effect_prior(
+        problem, fitting.Active(active.blocks, active.effects, active.weights, fitted.spread), fitted.x
+    )
+    w_global, w_local = w[..., :n], w[..., n:]
+    local = np.asarray(jnp.einsum("cmi,cmj->cij", w_local, w_local))
+    local = local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
+    for j in range(active.local_index.shape[1]):
+        local[:, j, j] += effect_curvature[active.local_index[:, j]]
+    local_inverse = jnp.asarray(np.linalg.inv(fitting.positive(local)) if local.shape[-1] else local)
+    cross = jnp.einsum("cml,cmg->clg", w_local, w_global)
+    reduced = w_global - jnp.einsum("cml,cli,cig->cmg", w_local, local_inverse, cross)
+    curvature = np.asarray(jnp.einsum("cmi,cmj->ij", w_global, reduced))
+    curvature = (
+        curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
+    )
+    inverse = np.linalg.inv(fitting.positive(curvature)) if n else curvature
+    return Projection(w_global, w_local, local_inverse, jnp.asarray(inverse), reduced)
+
+
+@dataclass(frozen=True)
+class Replicates:
+    """Data sets drawn at a fit, the nuisances refitted to first order, and what they say at the sites.
+
+    Attributes:
+        observed: projected rows of the data (cluster, row).
+        rows: whitened rows of the replicates (replicate, cluster, row), not projected.
+        values: observed values of the replicates by site.
+        gradients: site gradients of the data and of the first replicates, (1 + replicate, *site) by site.
+        projected: projected rows of those first replicates.
+    """
+
+    observed: jax.Array
+    rows: jax.Array
+    values: Mapping[str, jax.Array]
+    gradients: Mapping[str, jax.Array]
+    projected: jax.Array
+
+
+def replicate(
+    problem: Problem, fitted: fitting.Fit, projection: Projection, key: jax.Array, settings: Settings
+) -> Replicates:
+    """Draw the bootstrap that the screening and the maps share."""
+    rows, values = problem.replicate(fitted.x, jax.random.split(key, settings.replicates))
+    observed = projection.rows(problem.residual(fitted.x)[None])[0]
+    projected = projection.rows(rows[: settings.site_replicates])
+    gradients = problem.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
+    return Replicates(observed, rows, values, gradients, projected)
+
+
+def screen(
+    problem: Problem, fitted: fitting.Fit, projection: Projection, drawn: Replicates, settings: Settings
+) -> Screening:
+    """Score every candidate that the fit does not already contain."""
+    candidates = [e for e in problem.effects if e.name not in fitted.effects]
+    means = [e for e in candidates if e.kind == "mean"]
+    fields = [e for e in candidates if e.kind == "variance"]
+    around = surroundings(problem, fitted.x)
+    scores = _mean_scores(problem, fitted, projection, drawn, tangents(around, means, problem.programs))
+    energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
+    statistic = np.stack([energy[e.name] for e in fields], -1) if fields else None
+    mean_p, mean_z = _mean_tests(scores, scores.u[None])
+    null_p = _mean_tests(scores, scores.u_null)[0]
+    if statistic is None:
+        variance_p, variance_z, replicate_p = (
+            np.ones((1, 0)),
+            np.zeros((1, 0)),
+            null_p.min(axis=1, initial=1.0),
+        )
+        variance_bf = np.zeros(0)
+    else:
+        null = statistic[1:]
+        variance_p, variance_z = gamma_tail(statistic[:1], null.mean(0), null.var(0))
+        variance_bf = field_log_bayes_factor(statistic[0], null.mean(0), null.var(0))
+        variance_null = gamma_tail(null, null.mean(0), null.var(0))[0]
+        # The fields' replicates are the first of the same data sets.
+        replicate_p = np.minimum(
+            null_p[: len(null)].min(axis=1, initial=1.0), variance_null.min(axis=1, initial=1.0)
+        )
+    p = np.concatenate([mean_p[0], variance_p[0]])
+    names = [e.name for e in (*means, *fields)]
+    order = np.array([names.index(c.name) for c in candidates], int)
+    log_bf = np.concatenate([scores.log_bayes_factor, variance_bf])
+    return Screening(
+        names=tuple(c.name for c in candidates),
+        z=np.concatenate([mean_z[0], variance_z[0]])[order],
+        p_value=p[order],
+        adjusted=family_wise(p, replicate_p)[order],
+        log_bayes_factor=log_bf[order],
+        step={e.name: scores.step(k) for k, e in enumerate(means)},
+        absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),
+        detectable=np.array([_detectable(scores, c, settings) for c in candidates]),
+        correlation=_correlation(candidates, scores),
+        replicate_p=replicate_p,
+    )
+
+
+@dataclass(frozen=True)
+class _Scores:
+    """Adjusted scores of mean effects: u of the data and of the replicates, information, and what was projected away."""
+
+    effects: tuple[Effect, ...]
+    groups: tuple[np.ndarray, ...]
+    u: np.ndarray
+    u_null: np.ndarray
+    information: np.ndarray
+    total: np.ndarray
+    coefficients: np.ndarray
+
+    def scale(self, k: int) -> np.ndarray:
+        """Prior standard deviation of each parameter of one effect, flat."""
+        parts = [fitting.prior_scale(p.prior) * np.ones(p.shape) for p in self.effects[k].parameters]
+        return np.concatenate([part.reshape(-1) for part in parts])
+
+    def part(self, k: int) -> np.ndarray:
+        """Information of one effect's own parameters."""
+        return self.information[np.ix_(self.groups[k], self.groups[k])]
+
+    def root(self, k: int) -> np.ndarray:
+        """Columns that whiten one effect's scores, one per direction that the data can see."""
+        size = np.sqrt(np.maximum(self.total[self.groups[k]], 1e-300))
+        values, vectors = np.linalg.eigh(self.part(k) / np.outer(size, size))
+        keep = values > _NOTHING
+        return vectors[:, keep] / np.sqrt(values[keep]) / size[:, None]
+
+    def step(self, k: int) -> np.ndarray:
+        """One-step estimate of one effect's parameters."""
+        return np.linalg.solve(self.part(k) + np.diag(self.scale(k) ** -2.0), self.u[self.groups[k]])
+
+    @property
+    def log_bayes_factor(self) -> np.ndarray:
+        """Log BF = -1/2 log|I + T J| + 1/2 u' (J + T^-1)^-1 u of each effect, with prior covariance T."""
+        result = []
+        for k, group in enumerate(self.groups):
+            j, t = self.part(k), np.diag(self.scale(k) ** 2)
+            result.append(
+                -0.5 * np.linalg.slogdet(np.eye(len(group)) + np.sqrt(t) @ j @ np.sqrt(t))[1]
+                + 0.5 * self.u[group] @ self.step(k)
+            )
+        return np.array(result)
+
+
+def _mean_scores(
+    problem: Problem, fitted: fitting.Fit, projection: Projection, drawn: Replicates, found: Tangents
+) -> _Scores:
+    adjusted, coefficients = projection.adjust(found.columns)
+    information = np.array(jnp.einsum("cmi,cmj->ij", found.columns, adjusted))
+    total = np.array(jnp.einsum("cmi,cmi->i", found.columns, found.columns))
+    u = np.array(jnp.einsum("cmk,cm->k", adjusted, problem.residual(fitted.x)))
+    u_null = np.array(jnp.einsum("cmk,rcm->rk", adjusted, drawn.rows))
+    values = problem.observed_values()
+    for effect, group in zip(found.effects, found.groups, strict=True):
+        for extra in found.extra[effect.name]:
+            own = extra.shift.T @ extra.shift
+            information[np.ix_(group, group)] += own
+            total[group] += np.diag(own)
+            scores = extra.score(jnp.concatenate([values[extra.site][None], drawn.values[extra.site]]))
+            u[group] += scores[0]
+            u_null[:, group] += scores[1:]
+    information = (information + information.T) / 2
+    return _Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
+
+
+def family_wise(p: np.ndarray, replicate_p: np.ndarray) -> np.ndarray:
+    """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show."""
+    quantiles = np.quantile(np.maximum(replicate_p, 1e-300), [0.05, 0.1, 0.25, 0.5])
+    effective = np.log1p(-np.array([0.05, 0.1, 0.25, 0.5])) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
+    m = float(np.clip(np.max(effective), 1.0, 1e6))
+    return -np.expm1(m * np.log1p(-np.minimum(p, 1 - 1e-16)))
+
+
+def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Upper-tail p-value and normal quantile of a positive statistic with the given null mean and variance."""
+    nothing = mean <= 0
+    mean, variance = (
+        np.where(nothing, 1.0, mean),
+        np.where(nothing, 1.0, np.maximum(variance, 1e-12 * mean**2)),
+    )
+    observed = np.where(nothing, 1.0, observed)
+    log_p = np.where(nothing, 0.0, _log_gamma_tail(observed * mean / variance, mean**2 / variance))
+    return np.exp(np.maximum(log_p, _LOG_SMALLEST)), _quantile(log_p)
+
+
+def _log_gamma_tail(value: np.ndarray, shape: np.ndarray | float) -> np.ndarray:
+    """Log upper-tail probability of a unit gamma, by its asymptote where the probability underflows."""
+    log_p = stats.gamma.logsf(value, shape)
+    far = (shape - 1) * np.log(np.maximum(value, 1e-300)) - value - special.gammaln(shape)
+    return np.where(np.isfinite(log_p), log_p, far)
+
+
+def field_log_bayes_factor(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Rough log Bayes factor of a random field, from the energy of its scores: nu/2 (r - 1 - log r) - log(nu)/2."""
+    safe = np.maximum(mean, 1e-300)
+    nu, ratio = 2 * safe**2 / np.maximum(variance, 1e-12 * safe**2), np.maximum(observed / safe, 1.0)
+    return np.where(mean > 0, nu / 2 * (ratio - 1 - np.log(ratio)) - np.log(nu) / 2, -np.inf)
+
+
+def _quantile(log_p: np.ndarray) -> np.ndarray:
+    """Normal quantile of an upper-tail probability given by its logarithm."""
+    far = np.sqrt(np.maximum(-2 * log_p - np.log(np.maximum(-4 * np.pi * log_p, 1e-12)), 0.0))
+    return np.where(log_p > _LOG_SMALLEST, stats.norm.isf(np.exp(np.maximum(log_p, _LOG_SMALLEST))), far)
+
+
+def _mean_tests(scores: _Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """p-values and z of score vectors u (n, columns) for each effect, (n, effect)."""
+    p, z = np.ones((len(u), len(scores.effects))), np.zeros((len(u), len(scores.effects)))
+    for k, (effect, group) in enumerate(zip(scores.effects, scores.groups, strict=True)):
+        root = scores.root(k)
+        if not root.shape[1]:
+            continue
+        t = u[:, group] @ root
+        if len(group) == 1:
+            z[:, k] = t[:, 0] * np.sign(root[0, 0])
+            sided = effect.parameters[0].is_one_sided
+            p[:, k] = stats.norm.sf(z[:, k]) if sided else 2 * stats.norm.sf(np.abs(z[:, k]))
+        else:
+            square, d = (t**2).sum(1), root.shape[1]
+            log_p = _log_gamma_tail(square / 2, d / 2)
+            p[:, k], z[:, k] = np.exp(np.maximum(log_p, _LOG_SMALLEST)), _quantile(log_p)
+    return np.maximum(p, 1e-300), z
+
+
+def _absorbed(problem: Problem, fitted: fitting.Fit, scores: _Scores, effect: Effect) -> str | None:
+    """The nuisance that explains nearly all of an effect's own information."""
+    if effect.kind != "mean":
+        return None
+    k = [e.name for e in scores.effects].index(effect.name)
+    group = scores.groups[k]
+    if scores.total[group].max(initial=0.0) == 0.0:
+        return "nothing observed depends on it"
+    own = np.diag(scores.part(k))
+    left = own / np.maximum(scores.total[group], 1e-300)
+    if left.max() > 1 - _ABSORBED or (own * scores.scale(k) ** 2).max() > _SEEN:
+        return None
+    blocks = [b for b in fitting.activate(problem, fitted.effects).blocks if not b.local]
+    owners = np.concatenate([[i] * b.size for i, b in enumerate(blocks)]) if blocks else np.zeros(0, int)
+    if not len(owners):
+        return "the clusters' own parameters"
+    share = np.abs(scores.coefficients[:, group]).sum(1)
+    return blocks[int(owners[int(np.argmax(share))])].name
+
+
+def _detectable(scores: _Scores, effect: Effect, settings: Settings) -> float:
+    if effect.kind != "mean":
+        return float("nan")
+    k = [e.name for e in scores.effects].index(effect.name)
+    first = scores.groups[k][0]
+    own = float(scores.information[first, first])
+    needed = stats.norm.isf(settings.level / (4 * max(len(scores.effects), 1))) + stats.norm.isf(0.1)
+    return float(needed / np.sqrt(own)) if own > _NOTHING * scores.total[first] else float("inf")
+
+
+def _correlation(candidates: list[Effect], scores: _Scores) -> np.ndarray:
+    """Largest canonical correlation between the candidates' scores; zero where one has no information."""
+    result = np.eye(len(candidates))
+    roots: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for k, (effect, group) in enumerate(zip(scores.effects, scores.groups, strict=True)):
+        root = scores.root(k)
+        if root.shape[1]:
+            roots[effect.name] = (group, root)
+    for a, left in enumerate(candidates):
+        for b, right in enumerate(candidates[:a]):
+            if left.name in roots and right.name in roots:
+                (g, u), (h, v) = roots[left.name], roots[right.name]
+                singular = np.linalg.svd(u.T @ scores.information[np.ix_(g, h)] @ v, compute_uv=False)
+                result[a, b] = result[b, a] = min(float(singular[0]), 1.0)
+    return result

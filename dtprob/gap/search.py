@@ -1,0 +1,241 @@
+"""Which set of effects: conditional forward steps, each candidate refitted in full from several starts.
+
+First-order scores choose whom to try; the full refit decides, so a large gap, where expansions no longer hold, is judged
+by the model itself. After each accepted effect everything is re-centred at the new fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import jax
+import numpy as np
+
+from dtprob.effects.effect import Effect
+from dtprob.gap import fit as fitting
+from dtprob.gap.base import polish
+from dtprob.gap.problem import Problem
+from dtprob.gap.scan import Found, scan
+from dtprob.gap.screen import Projection, Screening, project, replicate, screen
+from dtprob.gap.settings import Settings
+from dtprob.gap.where import Location, locate
+
+type Say = Callable[[str], None]
+
+_LARGEST_FIELD = 96
+_LARGE_GAP = 100.0
+"""Nats above which first-order scores may miss the effect that matters."""
+
+
+@dataclass(frozen=True)
+class View:
+    """A fit seen from all sides: what it leaves, which candidates it calls for, where."""
+
+    problem: Problem
+    fitted: fitting.Fit
+    projection: Projection
+    screening: Screening
+    location: Location
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the search: the view of the fit before, the refits that were tried, and the accepted one."""
+
+    view: View
+    problem: Problem
+    trials: dict[str, fitting.Fit]
+    accepted: str | None
+
+
+def view(problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settings) -> View:
+    """Screen all candidates and map the gap at a fit, on one bootstrap."""
+    projection = project(problem, fitted)
+    drawn = replicate(problem, fitted, projection, key, settings)
+    screening = screen(problem, fitted, projection, drawn, settings)
+    return View(problem, fitted, projection, screening, locate(problem, fitted, projection, drawn))
+
+
+def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> list[Step]:
+    """Forward steps from the base fit until nothing is significant or worth its prior; the last step accepts nothing.
+
+    Args:
+        problem: the model and candidates on their data.
+        base: the fit of the model alone.
+        key: for the bootstrap.
+        settings: level, number of refits and largest set.
+        say: receives one line at each stage.
+    """
+    steps: list[Step] = []
+    fitted = base
+    while True:
+        say(
+            f"screening {len(problem.effects)} effects"
+            + (f" beside {', '.join(fitted.effects)}" * bool(fitted.effects))
+        )
+        seen = view(problem, fitted, jax.random.fold_in(key, len(steps)), settings)
+        if len(steps) == settings.max_effects or not alarmed(seen, settings):
+            return [*steps, Step(seen, problem, {}, None)]
+        if steps and _promise(seen) < settings.minor * (fitted.log_evidence - base.log_evidence):
+            return [*steps, Step(seen, problem, {}, None)]
+        problem, trials = _trials(seen, settings, say, first=not steps)
+        kinds = {e.name: e.kind for e in problem.effects}
+        accepted = _accept(seen.fitted, base, trials, kinds, len(seen.screening.names), settings)
+        steps.append(Step(seen, problem, trials, accepted))
+        if accepted is None:
+            return steps
+        fitted = polish(problem, trials[accepted])
+
+
+def _promise(seen: View) -> float:
+    """Nats that the best candidate or site could still bring, to first order."""
+    return max(
+        float(seen.screening.log_bayes_factor.max(initial=0.0)),
+        max((s.gain for s in seen.location.sites), default=0.0),
+    )
+
+
+def alarmed(seen: View, settings: Settings) -> bool:
+    """Whether the effects' scores or the site tests show a gap at the level."""
+    level = settings.level / 2
+    return float(seen.screening.adjusted.min(initial=1.0)) <= level or seen.location.site_p_value <= level
+
+
+def _accept(
+    fitted: fitting.Fit,
+    base: fitting.Fit,
+    trials: dict[str, fitting.Fit],
+    kinds: Mapping[str, str],
+    n: int,
+    settings: Settings,
+) -> str | None:
+    """The refit with the largest evidence, if it outweighs the choice among n candidates and is no minor matter.
+
+    A random field can imitate nearly anything, so an effect with parameters of its own is preferred when it reaches a good
+    part of the evidence; what the field would add on top is left to the next step.
+    """
+    if not trials:
+        return None
+    gain = {name: trial.log_evidence - fitted.log_evidence for name, trial in trials.items()}
+    best = max(gain, key=lambda name: gain[name])
+    plain = {name: value for name, value in gain.items() if kinds[name] == "mean"}
+    if plain and max(plain.values()) >= settings.relevance * gain[best]:
+        best = max(plain, key=lambda name: plain[name])
+    so_far = fitted.log_evidence - base.log_evidence
+    needed = max(np.log(n) + 3.0, settings.minor * so_far)
+    return best if gain[best] > needed else None
+
+
+def _trials(
+    seen: View, settings: Settings, say: Say, *, first: bool
+) -> tuple[Problem, dict[str, fitting.Fit]]:
+    """Refits of the most promising candidates, in a problem in which they are live."""
+    screening, fitted = seen.screening, seen.fitted
+    found: dict[str, Found] = {}
+    if first and _promise(seen) > _LARGE_GAP:
+        say("scanning the effects' plausible sizes")
+        found = scan(seen.problem, seen.fitted.x, screening.names)
+    scanned = np.array([found[n].gain if n in found else -np.inf for n in screening.names])
+    chosen = _chosen(seen, scanned, settings)
+    problem = seen.problem.with_live([*fitted.effects, *chosen])
+    start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
+    effects = {e.name: e for e in problem.effects}
+    trials = {}
+    for name in chosen:
+        say(f"refitting with {name}")
+        trials[name] = refit(
+            problem, start, effects[name], screening.step.get(name), settings, found.get(name), seen
+        )
+    return problem, trials
+
+
+def _chosen(seen: View, scanned: np.ndarray, settings: Settings) -> list[str]:
+    """The best candidates by score and, in equal number, by the scan."""
+    screening = seen.screening
+    able = [
+        i
+        for i, name in enumerate(screening.names)
+        if screening.absorbed_by[i] is None and _affordable(seen.problem, name)
+    ]
+    by_score = sorted(
+        (i for i in able if screening.log_bayes_factor[i] > 0), key=lambda i: -screening.log_bayes_factor[i]
+    )
+    by_scan = sorted((i for i in able if scanned[i] > 3.0), key=lambda i: -scanned[i])
+    half = settings.candidates // 2
+    chosen = dict.fromkeys([*by_score[:half], *by_scan[:half], *by_score[half:], *by_scan[half:]])
+    return [screening.names[i] for i in list(chosen)[: settings.candidates]]
+
+
+def _affordable(problem: Problem, name: str) -> bool:
+    """Whether a field is small enough per cluster to be fitted entry by entry."""
+    effect = next(e for e in problem.effects if e.name == name)
+    if effect.kind == "mean":
+        return True
+    shape = problem.float_sites[effect.sites[0]].shape
+    return int(np.prod(shape, dtype=int)) // problem.n_cluster <= _LARGEST_FIELD
+
+
+def refit(
+    problem: Problem,
+    fitted: fitting.Fit,
+    effect: Effect,
+    step: np.ndarray | None,
+    settings: Settings,
+    found: Found | None = None,
+    seen: View | None = None,
+) -> fitting.Fit:
+    """The best of several refits with one more effect: from its one-step estimate and from a grid over its prior."""
+    names = (*fitted.effects, effect.name)
+    if effect.kind == "variance":
+        return fitting.fit(problem, fitted.x, names)
+    index = np.concatenate([b.index[0] for b in problem.blocks_of(effect.name)])
+    starts = _starts(problem, fitted.x, effect, index, step, settings)
+    if found is not None and seen is not None:
+        scanned = problem.translate(found.x, seen.problem)
+        scanned[index] = found.parameters
+        starts.append(scanned)
+    fits = [fitting.fit(problem, x, names) for x in starts]
+    return max(fits, key=lambda f: f.log_evidence)
+
+
+def _starts(
+    problem: Problem,
+    x: np.ndarray,
+    effect: Effect,
+    index: np.ndarray,
+    step: np.ndarray | None,
+    settings: Settings,
+) -> list[np.ndarray]:
+    """The one-step estimate and the best local maxima of the log posterior along each parameter."""
+    scale = np.concatenate(
+        [(fitting.prior_scale(p.prior) * np.ones(p.shape)).reshape(-1) for p in effect.parameters]
+    )
+    sided = np.concatenate(
+        [np.full(int(np.prod(p.shape, dtype=int)), p.is_one_sided) for p in effect.parameters]
+    )
+    one_step = x.copy()
+    if step is not None:
+        moved = np.clip(step, -4 * scale, 4 * scale)
+        one_step[index] += np.where(sided, np.maximum(moved, 1e-3 * scale), moved)
+    lines = []
+    for j, position in enumerate(index[:12]):
+        half = np.linspace(-2.5, 2.5, 2 * settings.grid + 1)
+        fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
+        offsets = np.unique(np.concatenate([half, fine, -fine])) * scale[j]
+        offsets = offsets[offsets >= 0] if sided[j] else offsets
+        line = np.repeat(x[None], len(offsets), axis=0)
+        line[:, position] += offsets
+        lines.append(line)
+    values = np.asarray(problem.profile(np.concatenate([one_step[None], *lines])))
+    best = [(float(values[0]), one_step)]
+    low = 1
+    for line in lines:
+        v = values[low : low + len(line)]
+        low += len(line)
+        padded = np.concatenate([[-np.inf], np.where(np.isfinite(v), v, -np.inf), [-np.inf]])
+        peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+        best += [(float(v[k]), line[k]) for k in peaks]
+    ordered = sorted(best[1:], key=lambda b: -b[0])[: settings.starts]
+    floor = values[0] if len(ordered) else -np.inf
+    return [one_step] + [start for value, start in ordered if value > floor - 5.0]

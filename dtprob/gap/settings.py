@@ -1,0 +1,38 @@
+"""Settings of a diagnosis, with the defaults that the documented error rates were measured with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Settings:
+    """How a diagnosis is run.
+
+    Attributes:
+        level: false-alarm probability of a whole diagnosis, shared by the effects and the site tests.
+        replicates: bootstrap replicates of the score statistics.
+        site_replicates: bootstrap replicates of the site tests; each costs about one gradient.
+        candidates: how many effects are refitted in full at each step of the search.
+        max_effects: the largest set of effects that is looked for.
+        folds: parts of the clusters for cross-fitted held-out losses.
+        grid: trial sizes per effect parameter when a refit looks for its starting points.
+        starts: starting points of a refit.
+        credibility: probability that a reported class of causes must hold.
+        relevance: share of the gap that causes must close to count as its explanation.
+        minor: a further effect must add this share of the evidence that the effects before it have brought.
+        tolerance_db: residual error, in dB below the signal, that the user does not care about; None for no tolerance.
+    """
+
+    level: float = 0.01
+    replicates: int = 400
+    site_replicates: int = 99
+    candidates: int = 6
+    max_effects: int = 3
+    folds: int = 4
+    grid: int = 32
+    starts: int = 2
+    credibility: float = 0.9
+    relevance: float = 0.5
+    minor: float = 0.03
+    tolerance_db: float | None = None

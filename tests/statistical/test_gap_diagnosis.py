@@ -1,0 +1,308 @@
+"""Whole diagnoses of small models: each verdict where it is due, on several data sets and keys."""
+
+import json
+from dataclasses import dataclass
+from types import SimpleNamespace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.errors import InputError
+from dtprob.gap import diagnose as diagnosing
+from dtprob.gap.confirm import confirm
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.fit import fit
+from dtprob.gap.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.inference import Laplace
+from dtprob.models.declaration import split_static
+from tests.unit.gap.examples import (
+    SIGMA,
+    bend,
+    counts,
+    draw,
+    inputs,
+    jitter,
+    line,
+    pair,
+    ripple,
+    saturation,
+    tone,
+)
+
+EFFECTS = (bend(), ripple(), ripple("ripple5", 5.0), saturation(), jitter())
+FAST = Settings(replicates=200)
+
+
+@dataclass(frozen=True)
+class Started:
+    """An engine that returns what it was started at."""
+
+    initial: Any = None
+    name = "started"
+
+    def __call__(self, key, model, data, *, options=None):
+        """One draw."""
+        del key, model, data, options
+        return SimpleNamespace(draws={n: np.asarray(v)[None, None] for n, v in self.initial.items()})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def shared_compilation():
+    """Problems that differ only in their arrays share their compiled functions."""
+    known: dict[Any, Problem] = {}
+
+    def shared(key, make, data):
+        if key not in known:
+            known[key] = make()
+        problem = known[key]
+        problem.data, problem.arrays = dict(data), split_static(data)[0]
+        problem.programs._arrays = problem.arrays
+        return problem
+
+    def key_of(model, data, effects, cluster, live=()):
+        shapes = tuple((n, np.shape(v), str(np.asarray(v).dtype)) for n, v in data.items())
+        return model.__name__, shapes, tuple(e.name for e in effects), cluster, frozenset(live)
+
+    def make(model, data, effects, cluster=None, reference=None):
+        if reference is not None or cluster in data:
+            return Problem(model, data, effects, cluster, reference)
+        return shared(
+            key_of(model, data, effects, cluster), lambda: Problem(model, data, effects, cluster), data
+        )
+
+    plain = Problem.with_live
+
+    def with_live(self, names):
+        if (
+            self._reference is not None
+            or self._cluster in self.data
+            or set(names) <= {e.name for e in self.live}
+        ):
+            return plain(self, names)
+        key = key_of(self.model, self.data, self.effects, self._cluster, names)
+        return shared(key, lambda: plain(self, names), self.data)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(diagnosing, "Problem", make)
+        patch.setattr(Problem, "with_live", with_live)
+        yield
+
+
+def run(model, data, effects=EFFECTS, key=0, engine=None, **options):
+    options = {"settings": FAST, **options}
+    return diagnose(model, data, effects, key=jax.random.key(key), engine=engine or Started(), **options)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_no_gap_where_there_is_none(seed):
+    found = run(line, draw("line", seed=seed), key=seed)
+    assert found.verdict == "NO_GAP"
+    assert found.causes == ()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_true_effect_is_listed(seed):
+    found = run(line, draw("line", seed=10 + seed, shift=0.5 * inputs() ** 2), key=seed)
+    assert found.verdict == "LISTED"
+    cause = found.causes[0]
+    assert cause.effects == ("bend",)
+    assert cause.alias_class == (("bend",),)
+    assert cause.plausible
+    assert cause.probability > 0.9
+    assert abs(cause.size[0].mean - 0.5) < 0.15
+    fraction = cause.closed_fraction
+    assert fraction is not None
+    assert fraction.low <= fraction.mean <= fraction.high <= 1.0
+    assert fraction.mean > 0.85
+    assert fraction.low > 0.7
+
+
+def test_the_verdict_does_not_hang_on_the_key():
+    gap, none = draw("line", seed=5, shift=0.4 * np.sin(3 * inputs())), draw("line", seed=6)
+    found = [run(line, gap, key=k) for k in range(4)]
+    assert {(d.verdict, d.causes[0].effects) for d in found} == {("LISTED", ("ripple",))}
+    assert {run(line, none, key=k).verdict for k in range(4)} == {"NO_GAP"}
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_two_effects_are_found_one_after_the_other(seed):
+    shift = 0.5 * inputs() ** 2 + 0.5 * np.sin(3 * inputs())
+    found = run(line, draw("line", seed=20 + seed, shift=shift), key=seed)
+    assert found.verdict == "LISTED"
+    assert set(found.causes[0].effects) == {"bend", "ripple"}
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_an_effect_out_of_the_library_is_not_blamed_on_another(seed):
+    others = (saturation(), ripple("ripple9", 9.0))
+    shift = 0.8 * np.sin(3 * inputs())
+    found = run(line, draw("line", seed=30 + seed, shift=shift), others, key=seed)
+    assert found.verdict == "UNLISTED"
+    assert "mean" in found.to_report()["unlisted"]["sites"]
+
+
+def test_two_names_of_one_rewrite_are_one_class():
+    effects = (*EFFECTS, ripple("twin"))
+    found = run(line, draw("line", seed=7, shift=0.5 * np.sin(3 * inputs())), effects)
+    assert found.verdict == "UNDETERMINED"
+    assert set(found.causes[0].alias_class) == {("ripple",), ("twin",)}
+    assert abs(found.causes[0].probability - 0.5) < 0.01
+    assert found.sections["next_measurement"] is not None
+    screening = found.maps["screening"]
+    assert float(screening.correlation.sel(effect="ripple", other_effect="twin")) > 0.999
+
+
+def test_random_levels_are_a_variance_effect():
+    shift = 0.8 * np.random.default_rng(3).normal(size=(12, 1))
+    found = run(line, draw("line", seed=8, shift=shift))
+    assert found.verdict == "LISTED"
+    assert found.causes[0].effects == ("jitter",)
+    size = found.causes[0].size[0]
+    assert size.low < 0.8 < size.high
+
+
+def test_counts_and_turned_tones_are_diagnosed_too():
+    found = run(counts, draw("counts", shift=0.25 * inputs() ** 2), (bend(), ripple()))
+    assert (found.verdict, found.causes[0].effects) == ("LISTED", ("bend",))
+    found = run(tone, draw("tone", shift=0.3 * inputs() ** 2), (bend(), ripple()))
+    assert (found.verdict, found.causes[0].effects) == ("LISTED", ("bend",))
+    assert run(tone, draw("tone"), (bend(), ripple())).verdict == "NO_GAP"
+
+
+def raised():
+    """Adds to the level, as another value of `a` would."""
+    return Effect(
+        "raised",
+        {"level": lambda v, p, _: v + p["c"]},
+        (Parameter("c", dist.Normal(0.0, 1.0)),),
+        physics="level",
+    )
+
+
+def test_a_change_that_the_fit_can_follow_is_no_gap():
+    found = run(line, draw("line", shift=0.6), (raised(), bend()))
+    assert found.verdict == "NO_GAP"
+    assert {s["effect"]: s["absorbed_by"] for s in found.to_report()["screening"]}["raised"] == "a"
+
+
+class Earlier:
+    """What 96 earlier observations say of the line, without its correlation."""
+
+    def sample(self, key, n):
+        """Draws of both parameters."""
+        noise = SIGMA / np.sqrt(96) * np.asarray(jax.random.normal(key, (2, n)))
+        return {"a": 0.7 + noise[0], "b": -1.2 + noise[1]}
+
+
+def test_earlier_data_turn_a_change_into_a_gap():
+    found = run(line, draw("line", seed=41, shift=0.6), (raised(), bend()), reference=Earlier())
+    assert (found.verdict, found.causes[0].effects) == ("LISTED", ("raised",))
+    assert abs(found.causes[0].size[0].mean - 0.6) < 0.25
+
+
+def test_sizes_too_are_relative_to_earlier_data():
+    plain = Problem(line, draw("line", seed=41, shift=0.6), (raised(),), None, Earlier())
+    problem = plain.with_live(["raised"])
+    fitted = fit(problem, problem.null(), ["raised"])
+    sizes, _ = confirm(problem, fitted, problem.effects, jax.random.key(0), Laplace())
+    assert sizes[0].low < 0.6 < sizes[0].high
+    assert sizes[0].high - sizes[0].low < 0.4  # twice 1.64 standard deviations of 0.07, and room
+
+
+def test_sizes_come_from_the_engine():
+    plain = Problem(line, draw("line", seed=10, shift=0.5 * inputs() ** 2), (bend(),))
+    problem = plain.with_live(["bend"])
+    fitted = fit(problem, problem.null(), ["bend"])
+    sizes, plausible = confirm(problem, fitted, problem.effects, jax.random.key(0), Laplace())
+    index = problem.layout["bend.c"].offset
+    mean, sd = fitted.x[index], np.sqrt(fitted.covariance[index, index])
+    assert plausible
+    assert abs(sizes[0].mean - mean) < 0.2 * sd  # 1000 draws
+    np.testing.assert_allclose(
+        [sizes[0].low, sizes[0].high], mean + 1.645 * sd * np.array([-1, 1]), atol=0.25 * sd
+    )
+
+
+def test_a_tolerance_makes_a_small_gap_none():
+    data = draw("line", seed=10, shift=0.5 * inputs() ** 2)  # listed without one
+    assert run(line, data, settings=Settings(replicates=200, tolerance_db=0.5)).verdict == "NO_GAP"
+
+
+def rows(x, device, y=None):
+    """Line whose clusters are named by a column."""
+    del device
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("row", x.shape[0]):
+        offset = numpyro.deterministic("offset", jnp.zeros_like(x))
+        mean = numpyro.deterministic("mean", offset + slope * x)
+        numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+def test_a_column_may_name_the_clusters():
+    rng = np.random.default_rng(0)
+    x, device = rng.normal(size=90), rng.integers(0, 9, 90)
+    y = -1.2 * x + 0.5 * x**2 + SIGMA * rng.normal(size=90)
+    data = {"x": jnp.asarray(x), "device": device, "y": jnp.asarray(y)}
+    found = run(rows, data, (bend(),), cluster="device")
+    assert (found.verdict, found.causes[0].effects) == ("LISTED", ("bend",))
+    assert found.to_report()["fit"]["n_clusters"] == 9
+    assert found.maps["clusters"].sizes["device"] == 9
+
+
+def test_the_report_is_plain_and_the_maps_are_named():
+    found = run(line, draw("line", seed=10, shift=0.5 * inputs() ** 2))
+    report = json.loads(json.dumps(found.to_report(), allow_nan=False))
+    assert report["verdict"] == "LISTED"
+    assert report["causes"][0]["closed_fraction"]["mean"] > 0.8
+    assert report["gap"]["before"] > report["gap"]["after"]
+    assert report["screening"][0]["effect"] == "bend"
+    assert report["where"]["sites"][0]["site"] == "mean"
+    slope = next(n for n in report["fit"]["nuisances"] if n["name"] == "b")
+    assert slope["low"] < slope["mean"] < slope["high"]
+    assert 0.9 < slope["contraction"] <= 1.0
+    tree = found.to_datatree()
+    assert {"where", "links", "screening"} <= set(tree.children)
+    assert tree["links"].sizes["link"] == 12
+
+
+def test_no_effects_are_refused():
+    with pytest.raises(InputError, match="at least one candidate"):
+        run(line, draw("line"), ())
+
+
+def test_three_clusters_are_refused():
+    with pytest.raises(InputError, match="at least 4"):
+        run(line, draw("line", x=inputs(n_link=3)))
+
+
+def test_an_effect_on_an_absent_site_is_refused():
+    lost = Effect("lost", {"gain": lambda v, p, _: v + p["c"]}, (Parameter("c", dist.Normal(0.0, 1.0)),))
+    with pytest.raises(InputError, match="effect lost"):
+        run(line, draw("line"), (lost,))
+
+
+def waiting(x, y=None):
+    """Observations that the diagnosis cannot whiten."""
+    with numpyro.plate("row", x.shape[0]):
+        mean = numpyro.deterministic("mean", x)
+        numpyro.sample("y", dist.Gamma(jnp.exp(mean), 1.0), obs=y)
+
+
+def test_an_unknown_distribution_is_refused():
+    with pytest.raises(InputError, match="Gamma"):
+        run(waiting, {"x": jnp.zeros(6), "y": jnp.ones(6)}, (bend(),))
+
+
+def test_a_pair_of_parameters_is_one_effect():
+    x = inputs()
+    found = run(line, draw("line", seed=11, shift=0.5 * np.cos(2 * x) + 0.1 * x**3), (pair(), saturation()))
+    assert (found.verdict, found.causes[0].effects) == ("LISTED", ("pair",))
+    assert [s.name for s in found.causes[0].size] == ["c_0", "c_1"]
+    assert abs(found.causes[0].size[1].mean - 0.5) < 0.25

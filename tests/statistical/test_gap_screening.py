@@ -1,0 +1,158 @@
+"""Screening: scores against closed forms, and false alarms over data sets without a gap."""
+
+import jax
+import numpy as np
+import pytest
+from scipy import stats
+
+from dtprob.gap import fit as fitting
+from dtprob.gap.problem import Problem
+from dtprob.gap.screen import family_wise, gamma_tail, project, replicate, screen
+from dtprob.gap.search import view
+from dtprob.gap.settings import Settings
+from dtprob.models.declaration import split_static
+from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation
+
+EFFECTS = (bend(), ripple(), ripple("ripple5", 5.0), pair(), saturation(), jitter())
+FAST = Settings(replicates=200, site_replicates=99)
+
+
+def use(problem, data):
+    """Put other data of the same shapes into a compiled problem."""
+    problem.data = dict(data)
+    problem.arrays = split_static(data)[0]
+    problem.programs._arrays = problem.arrays
+    return problem
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return Problem(line, draw("line"), EFFECTS)
+
+
+def fitted_to(problem, data):
+    use(problem, data)
+    return fitting.fit(problem, np.zeros(2), tolerance=1e-9)
+
+
+def projection_of(x):
+    """Whitened nuisance columns of the line, and what is left of any column after them."""
+    columns = np.stack([np.ones(x.size), x.ravel()], axis=1) / SIGMA
+    inverse = np.linalg.inv(columns.T @ columns + np.diag([2.0**-2, 3.0**-2]))
+    return np.eye(x.size) - columns @ inverse @ columns.T
+
+
+def look(problem, data, key=0, settings=FAST):
+    fitted = fitted_to(problem, data)
+    projection = project(problem, fitted)
+    drawn = replicate(problem, fitted, projection, jax.random.key(key), settings)
+    return fitted, projection, drawn, screen(problem, fitted, projection, drawn, settings)
+
+
+def test_scores_are_those_of_neymans_test(problem):
+    data = draw("line", shift=0.1 * inputs() ** 2)
+    fitted, _, _, found = look(problem, data)
+    x, y = np.asarray(data["x"]), np.asarray(data["y"])
+    e = (y - fitted.x[0] - fitted.x[1] * x).ravel() / SIGMA
+    left = projection_of(x)
+    columns = {
+        "bend": x**2,
+        "ripple": np.sin(3 * x),
+        "ripple5": np.sin(5 * x),
+        "saturation": -np.abs(x),
+    }
+    for name, column in columns.items():
+        w = column.ravel() / SIGMA
+        z = (left @ w) @ e / np.sqrt(w @ left @ w)
+        k = found.names.index(name)
+        np.testing.assert_allclose(found.z[k], z, rtol=1e-6)
+        p = stats.norm.sf(z) if name == "saturation" else 2 * stats.norm.sf(abs(z))
+        np.testing.assert_allclose(found.p_value[k], p, rtol=1e-6)
+        if name == "bend":  # prior N(0, 1): exact here, since all is Gaussian
+            u, j = (left @ w) @ e, w @ left @ w
+            np.testing.assert_allclose(found.step[name], [u / (j + 1)], rtol=1e-6)
+            np.testing.assert_allclose(
+                found.log_bayes_factor[k], -0.5 * np.log1p(j) + 0.5 * u**2 / (j + 1), rtol=1e-6
+            )
+    k = found.names.index("pair")
+    w = np.stack([x.ravel() ** 3 / 3, np.cos(2 * x.ravel())], axis=1) / SIGMA
+    u, j = (left @ w).T @ e, w.T @ left @ w
+    np.testing.assert_allclose(found.p_value[k], stats.chi2.sf(u @ np.linalg.solve(j, u), 2), rtol=1e-6)
+
+
+def test_correlations_of_scores(problem):
+    data = draw("line")
+    found = look(problem, data)[3]
+    x = np.asarray(data["x"]).ravel()
+    left = projection_of(x)
+    a, b = x**2, np.abs(x)
+    expected = abs(a @ left @ b) / np.sqrt(a @ left @ a * (b @ left @ b))
+    i, k = found.names.index("bend"), found.names.index("saturation")
+    np.testing.assert_allclose(found.correlation[i, k], expected, rtol=1e-6)
+
+
+def test_a_variance_effect_follows_its_quadratic_form(problem):
+    data = draw("line")
+    settings = Settings(replicates=600, site_replicates=600)
+    fitted, _, drawn, found = look(problem, data, settings=settings)
+    x, y = np.asarray(data["x"]), np.asarray(data["y"])
+    left = projection_of(x)
+    member = np.kron(np.eye(len(x)), np.ones((x.shape[1], 1))) / SIGMA
+    # Gradients are taken on rows that have been projected already.
+    form = left @ member @ member.T @ left
+    mean, variance = np.trace(form), 2 * np.trace(form @ form)
+    energy = problem.programs.field_energy(
+        {n: np.asarray(v) for n, v in problem.sites(fitted.x).items()}, drawn.gradients
+    )["jitter"]
+    null = energy[1:]
+    assert abs(null.mean() - mean) < 5 * np.sqrt(variance / len(null))
+    assert abs(null.var() / variance - 1) < 0.35
+    e = left @ ((y - fitted.x[0] - fitted.x[1] * x).ravel() / SIGMA)
+    np.testing.assert_allclose(energy[0], ((member.T @ e) ** 2).sum(), rtol=1e-5)
+    weights = np.linalg.eigvalsh(form)
+    chance = np.random.default_rng(0).chisquare(1, (20_000, len(weights))) @ weights
+    exact = (chance > energy[0]).mean()
+    assert abs(found.p_value[found.names.index("jitter")] - exact) < 0.06
+
+
+def test_gamma_tail_is_exact_and_goes_on_where_it_underflows():
+    p, z = gamma_tail(np.array([7.0]), np.array([4.0]), np.array([8.0]))  # chi-square of 4
+    np.testing.assert_allclose(p, stats.chi2.sf(7.0, 4), rtol=1e-9)
+    np.testing.assert_allclose(z, stats.norm.isf(p), rtol=1e-9)
+    values = np.geomspace(10, 1e5, 200)
+    p, z = gamma_tail(values, np.full(200, 4.0), np.full(200, 8.0))
+    assert np.all(np.isfinite(z))
+    assert np.all(np.diff(z) > 0)
+    np.testing.assert_allclose(z[-1], np.sqrt(2 * 0.5e5), rtol=0.01)
+    assert gamma_tail(np.array([1.0]), np.array([0.0]), np.array([0.0]))[0] == 1.0
+
+
+@pytest.mark.parametrize("m", [1, 20, 300])
+def test_family_wise_matches_independent_tests(m):
+    replicates = np.random.default_rng(m).uniform(size=(4000, m)).min(1)
+    p = np.array([1e-4, 1e-3, 0.01]) / m
+    np.testing.assert_allclose(family_wise(p, replicates), -np.expm1(m * np.log1p(-p)), rtol=0.15)
+
+
+def test_family_wise_sees_that_copies_are_one_test():
+    replicates = np.random.default_rng(0).uniform(size=4000)
+    np.testing.assert_allclose(family_wise(np.array([0.01]), replicates), 0.01, rtol=0.15)
+
+
+def test_false_alarms_and_power_over_many_data_sets(problem):
+    settings = Settings(replicates=60, site_replicates=60)
+    n, level, strong = 200, 0.1, 10
+    by_effects, by_sites, first = np.zeros(n), np.zeros(n), []
+    for i in range(n + strong):
+        data = draw("line", seed=100 + i, shift=0.25 * inputs() ** 2 * (i >= n))
+        seen = view(problem, fitted_to(problem, data), jax.random.key(i), settings)
+        if i < n:
+            by_effects[i], by_sites[i] = seen.screening.adjusted.min(), seen.location.site_p_value
+        else:
+            first.append(seen.screening.names[int(seen.screening.p_value.argmin())])
+            assert seen.screening.adjusted.min() < 0.01
+    for p in (by_effects, by_sites):
+        alarms = int((p <= level).sum())
+        # An exact test would lie within; one that hardly ever speaks is no test.
+        assert stats.binom.ppf(1e-3, n, level / 2) <= alarms <= stats.binom.ppf(0.999, n, level)
+    assert first.count("bend") >= strong - 1

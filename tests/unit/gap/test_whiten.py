@@ -1,0 +1,215 @@
+"""Whitened rows: mean, covariance, score and information of every family against its density."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.distributions import ComplexStudentT
+from dtprob.errors import InputError
+from dtprob.gap import whiten
+from dtprob.models.complex_normal import ComplexNormal
+
+
+def strong(value):
+    """An array whose dtype, unlike a Python number's, wins over single precision."""
+    return jnp.asarray(np.asarray(value))
+
+
+LOGITS = jnp.array([0.3, -1.2, 0.8])
+PROBABILITY = jax.nn.softmax(LOGITS)
+
+# (family, make distribution, parameters, tangent)
+FAMILIES = {
+    "ComplexNormal": (
+        ComplexNormal,
+        {"loc": strong(0.4 - 1.1j), "variance": strong(1.7)},
+        {"loc": strong(0.6 + 0.9j), "variance": strong(-0.8)},
+    ),
+    "ComplexStudentT": (
+        ComplexStudentT,
+        {"loc": strong(0.4 - 1.1j), "variance": strong(1.7), "tail": strong(0.0)},
+        {"loc": strong(0.6 + 0.9j), "variance": strong(-0.8), "tail": strong(0.5)},
+    ),
+    "Normal": (
+        dist.Normal,
+        {"loc": strong(-0.3), "scale": strong(0.6)},
+        {"loc": strong(0.7), "scale": strong(0.4)},
+    ),
+    "LogNormal": (
+        dist.LogNormal,
+        {"loc": strong(-0.3), "scale": strong(0.6)},
+        {"loc": strong(0.7), "scale": strong(0.4)},
+    ),
+    "StudentT": (
+        lambda loc, scale, df: dist.StudentT(df, loc, scale),
+        {"loc": strong(-0.3), "scale": strong(0.6), "df": strong(5.0)},
+        {"loc": strong(0.7), "scale": strong(0.4), "df": strong(0.0)},
+    ),
+    "BernoulliLogits": (
+        lambda logits: dist.Bernoulli(logits=logits),
+        {"logits": strong(0.9)},
+        {"logits": strong(0.7)},
+    ),
+    "BernoulliProbs": (
+        lambda probs: dist.Bernoulli(probs=probs),
+        {"probs": strong(0.8)},
+        {"probs": strong(0.3)},
+    ),
+    "Poisson": (dist.Poisson, {"rate": strong(2.3)}, {"rate": strong(0.6)}),
+    "CategoricalLogits": (
+        lambda logits: dist.Categorical(logits=logits),
+        {"logits": LOGITS},
+        {"logits": jnp.array([0.5, -0.2, 0.4])},
+    ),
+    "CategoricalProbs": (
+        lambda probs: dist.Categorical(probs=probs),
+        {"probs": PROBABILITY},
+        {"probs": jnp.array([0.3, -0.1, -0.2])},
+    ),
+}
+COUNT = 100_000
+
+
+def draws(family, n=COUNT):
+    make, parameters, _ = FAMILIES[family]
+    return make(**parameters).sample(jax.random.key(3), (n,))
+
+
+def batch(family, values):
+    make, parameters, _ = FAMILIES[family]
+    expanded = {k: jnp.broadcast_to(v, (*values.shape, *jnp.shape(v))) for k, v in parameters.items()}
+    return whiten.observation(make(**expanded), values, "y")
+
+
+def tangent_of(family, values):
+    return {k: jnp.broadcast_to(v, (*values.shape, *jnp.shape(v))) for k, v in FAMILIES[family][2].items()}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_residuals_have_mean_zero_and_unit_covariance(family):
+    values = draws(family)
+    rows = np.asarray(whiten.residual(batch(family, values), values))
+    expected = np.eye(len(rows))
+    if family.startswith("Categorical"):  # one row per class; they sum to zero along sqrt(p)
+        root = np.sqrt(np.asarray(PROBABILITY))
+        expected = expected - np.outer(root, root)
+    fourth = (rows[:, None] ** 2 * rows[None] ** 2).mean(-1)
+    assert np.all(np.abs(rows.mean(1)) < 5 / np.sqrt(COUNT))
+    assert np.all(np.abs(np.cov(rows) - expected) < 5 * np.sqrt(fourth / COUNT) + 1e-9)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_score_is_the_slope_of_the_log_density(family):
+    make, parameters, tangent = FAMILIES[family]
+    values = draws(family, 50)
+    score = jnp.sum(
+        whiten.residual(batch(family, values), values)
+        * whiten.shift(batch(family, values), tangent_of(family, values)),
+        axis=0,
+    )
+    h = 1e-6 if family != "ComplexStudentT" else 1e-5
+
+    def density(t):
+        moved = {k: v + t * tangent[k] for k, v in parameters.items()}
+        if family == "CategoricalProbs":
+            return jnp.log(moved["probs"])[values]
+        return make(**moved).log_prob(values)
+
+    if family == "ComplexStudentT":  # one-sided in the tail
+        slope = (4 * density(h) - density(2 * h) - 3 * density(0.0)) / (2 * h)
+    else:
+        slope = (density(h) - density(-h)) / (2 * h)
+    np.testing.assert_allclose(score, slope, rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize("tail", [0.05, 0.4])
+def test_score_of_heavy_tails_away_from_the_null(tail):
+    parameters = {"loc": strong(0.4 - 1.1j), "variance": strong(1.7), "tail": strong(tail)}
+    tangent = {"loc": strong(0.6 + 0.9j), "variance": strong(-0.8), "tail": strong(0.5)}
+    values = ComplexStudentT(**parameters).sample(jax.random.key(0), (40,))
+    wide = {k: jnp.broadcast_to(v, (40,)) for k, v in parameters.items()}
+    observed = whiten.Observation("ComplexStudentT", wide)
+    moved = {k: jnp.broadcast_to(v, (40,)) for k, v in tangent.items()}
+    score = jnp.sum(whiten.residual(observed, values) * whiten.shift(observed, moved), axis=0)
+
+    def density(t):
+        return ComplexStudentT(**{k: v + t * tangent[k] for k, v in parameters.items()}).log_prob(values)
+
+    np.testing.assert_allclose(score, jax.jacfwd(density)(0.0), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("tail", [0.0, 0.2])
+def test_fisher_of_location_and_variance_under_heavy_tails(tail):
+    parameters = {"loc": strong(0.4 - 1.1j), "variance": strong(1.7), "tail": strong(tail)}
+    values = ComplexStudentT(**parameters).sample(jax.random.key(5), (COUNT,))
+    wide = {k: jnp.broadcast_to(v, values.shape) for k, v in parameters.items()}
+    rows = np.asarray(whiten.residual(whiten.Observation("ComplexStudentT", wide), values))[:3]
+    fourth = (rows[:, None] ** 2 * rows[None] ** 2).mean(-1)
+    assert np.all(np.abs(np.cov(rows) - np.eye(3)) < 5 * np.sqrt(fourth / COUNT))
+
+
+@pytest.mark.parametrize("family", ["ComplexNormal", "StudentT", "CategoricalLogits"])
+def test_information_is_the_variance_of_the_score(family):
+    make, parameters, tangent = FAMILIES[family]
+    values = draws(family, COUNT)
+    one = values[:1]
+    shift = np.asarray(whiten.shift(batch(family, one), tangent_of(family, one)))[:, 0]
+    information = float(shift @ shift)
+    score = np.asarray(
+        jnp.sum(
+            whiten.residual(batch(family, values), values) * jnp.asarray(shift).reshape(-1, 1),
+            axis=0,
+        )
+    )
+    spread = 5 * np.sqrt((score**4).mean() / COUNT)
+    assert abs(score.var() - information) < spread
+    if family not in ("ComplexStudentT", "CategoricalProbs"):  # minus the mean curvature, by differentiation
+
+        def density(t):
+            return jnp.mean(make(**{k: v + t * tangent[k] for k, v in parameters.items()}).log_prob(values))
+
+        curvature = -float(jax.grad(jax.grad(density))(0.0))
+        assert abs(curvature - information) < max(0.02 * information, spread)
+
+
+def test_masked_entries_say_nothing():
+    value = jnp.arange(4.0)
+    mask = jnp.array([True, False, True, False])
+    fn = dist.Normal(jnp.zeros(4), 2.0).mask(mask).to_event(1)
+    observed = whiten.observation(fn, value, "y")
+    rows = whiten.residual(observed, value)
+    shift = whiten.shift(observed, {"loc": jnp.ones(4), "scale": jnp.ones(4)})
+    density = whiten.log_prob(observed, value)
+    assert np.all(np.asarray(rows)[:, ~np.asarray(mask)] == 0)
+    assert np.all(np.asarray(shift)[:, ~np.asarray(mask)] == 0)
+    np.testing.assert_allclose(density.sum(), fn.log_prob(value), rtol=1e-12)
+
+
+def test_wrappers_are_looked_through():
+    value = jnp.zeros((3, 2))
+    fn = dist.Normal(jnp.array([1.0, 2.0]), 0.5).expand((3, 2)).to_event(2)
+    observed = whiten.observation(fn, value, "y")
+    assert observed.family == "Normal"
+    np.testing.assert_allclose(observed.parameters["loc"], [[1.0, 2.0]] * 3)
+    np.testing.assert_allclose(whiten.log_prob(observed, value).sum(), fn.log_prob(value), rtol=1e-12)
+
+
+def test_samples_follow_the_observation():
+    observed = whiten.Observation("Poisson", {"rate": jnp.full(20_000, 3.0)})
+    values = whiten.sample(observed, jax.random.key(0))
+    assert abs(float(values.mean()) - 3.0) < 5 * np.sqrt(3.0 / 20_000)
+
+
+def test_unknown_distribution_is_refused_by_name():
+    with pytest.raises(InputError, match=r"observed site 'y'.*Gamma"):
+        whiten.observation(dist.Gamma(2.0, 1.0), jnp.ones(()), "y")
+
+
+@pytest.mark.parametrize("logit", [-60.0, 60.0])
+def test_certain_bernoulli_stays_finite(logit):
+    value = jnp.array([float(logit > 0)])
+    observed = whiten.observation(dist.Bernoulli(logits=jnp.array([logit])), value, "y")
+    assert np.all(np.isfinite(whiten.residual(observed, value)))
+    assert np.all(np.isfinite(whiten.shift(observed, {"logits": jnp.ones(1)})))
