@@ -1,0 +1,182 @@
+"""The figures of one report's page, each with a caption and a description for those who cannot see it."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+import xarray as xr
+from markupsafe import Markup
+
+from dtprob.report.figures import (
+    IntervalRow,
+    classes_for,
+    coordinate_map,
+    gap_track,
+    interval_plot,
+    plan_view,
+)
+from dtprob.report.json_schema import Report
+from dtprob.report.names import capital, together, words
+from dtprob.report.svg import inline_svg
+from dtprob.report.units import number, scale_for
+
+_BEFORE, _AFTER = "gap_", "gap_after_"
+_MOST_MAPS = 6
+
+
+@dataclass(frozen=True)
+class Chart:
+    """One figure of the page."""
+
+    svg: Markup
+    caption: str
+
+
+def gap_chart(report: Report) -> Chart:
+    """The loss before and after, against the lowest possible."""
+    gap = report["gap"]
+    floor = None if gap["floor"] is None else (float(gap["floor"][0]), float(gap["floor"][1]))
+    told = [f"Loss of the twin as it is: {number(gap['before'])} {gap['unit']}."]
+    if gap["after"] is not None:
+        told.append(f"With the cause: {number(gap['after'])}.")
+    if floor is not None:
+        told.append(f"Best possible: between {number(floor[0])} and {number(floor[1])}.")
+    figure = gap_track(gap["before"], gap["after"], floor, unit=gap["unit"])
+    caption = "Shorter bars are better; the best possible ends somewhere in the lowest bar."
+    return Chart(
+        inline_svg(figure, " ".join(told)), caption if floor is not None else "Further left is better."
+    )
+
+
+def closing_chart(report: Report) -> Chart | None:
+    """The closed fraction of each cause, where there are several to compare, but not too many."""
+    rows = [
+        IntervalRow(
+            capital(together(cause["effects"])), *(100 * closed[key] for key in ("mean", "low", "high"))
+        )
+        for cause in report["causes"]
+        if (closed := cause["closed_fraction"]) is not None
+    ]
+    if not 2 <= len(rows) <= 12:
+        return None
+    told = "; ".join(f"{row.name} {row.mean:.0f}% ({row.low:.0f}% to {row.high:.0f}%)" for row in rows)
+    figure = interval_plot(rows, label="Gap closed on held-out data (%)", null=0.0, bounds=(0.0, 100.0))
+    return Chart(
+        inline_svg(figure, f"Share of the gap closed: {told}."),
+        "How much of the gap each cause closes when it is added alone, with 90% intervals.",
+    )
+
+
+def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
+    """A map of the gap over each axis that gap.nc holds, those that the report names first."""
+    data = _group(gap, "where", report)
+    named = [axis for entry in report["where"]["coordinates"] for axis in entry["axes"]]
+    axes = [name[len(_BEFORE) :] for name in map(str, data) if _is_before(name) and data[name].count() > 1]
+    ordered = sorted(axes, key=lambda axis: named.index(axis) if axis in named else len(named))
+    return [_coordinate_chart(data, axis) for axis in ordered[:_MOST_MAPS]]
+
+
+def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
+    """The links seen from above, before and after, in the same colours."""
+    data = _group(gap, "links", report)
+    if not {"rx_position", "tx_position", "before"} <= set(data):
+        return []
+    data = data.dropna(str(data["before"].dims[0]))
+    views = [name for name in ("before", "after") if name in data]
+    classes = classes_for(*(data[name].values for name in views))
+    return [
+        Chart(
+            inline_svg(
+                plan_view(
+                    data["rx_position"].values,
+                    data["tx_position"].values,
+                    data[name].values,
+                    classes=classes,
+                    label="Excess of each link (nats)",
+                ),
+                _plan_alt(data[name], data["rx_position"].values, name),
+            ),
+            f"{_WHEN[name]}. {_DOTS}",
+        )
+        for name in views
+    ]
+
+
+_DOTS = "Dots are receivers, triangles transmitters. The larger and stronger a dot, the worse its fit."
+_WHEN = {"before": "The twin as it is", "after": "With the cause added"}
+
+
+def _is_before(name: str) -> bool:
+    return name.startswith(_BEFORE) and not name.startswith(_AFTER)
+
+
+def _group(gap: xr.DataTree | None, name: str, report: Report) -> xr.Dataset:
+    """A group of gap.nc, infinite values as missing; nothing "after" without an accepted cause."""
+    if gap is None or name not in gap.children:
+        return xr.Dataset()
+    dataset = gap[name].to_dataset()
+    accepted = report["gap"]["after"] is not None
+    kept = [key for key in map(str, dataset.data_vars) if accepted or "after" not in key.split("_")]
+    return dataset[kept].where(np.abs(dataset[kept]) < np.inf)
+
+
+def _coordinate_chart(data: xr.Dataset, axis: str) -> Chart:
+    complete = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]].dropna(axis)
+    before, after = complete[_BEFORE + axis], complete.get(_AFTER + axis)
+    place, unit = _places(before, axis)
+    name = capital(words(axis))
+    figure = coordinate_map(
+        place,
+        before.values,
+        None if after is None else after.values,
+        label=f"{name} ({unit})" if unit else name,
+        threshold=before.attrs.get("threshold"),
+    )
+    told = f"Gap over {words(axis)}: {_peak(before.values, place, 'before')}"
+    if after is not None:
+        told += f"; {_peak(after.values, place, 'after')}"
+    caption = (
+        f"{name}: how much more the data stray from the twin than they should. "
+        "Grey: where all values stay, in 95 of 100 cases, when the twin is right."
+    )
+    return Chart(inline_svg(figure, f"{told}."), caption)
+
+
+def _places(values: xr.DataArray, axis: str) -> tuple[np.ndarray, str]:
+    """Coordinates in human units; without coordinates, their number."""
+    if axis not in values.coords:
+        return np.arange(values.size), ""
+    coordinate = values.coords[axis]
+    unit = str(coordinate.attrs.get("units", ""))
+    if not unit or not np.issubdtype(coordinate.dtype, np.number):
+        return coordinate.values, unit
+    scale = scale_for([float(np.abs(coordinate.values).max())], unit)
+    return coordinate.values * scale.factor, scale.unit
+
+
+def _peak(values: np.ndarray, place: np.ndarray, name: str) -> str:
+    top = int(np.argmax(values))
+    where = number(float(place[top])) if np.issubdtype(place.dtype, np.number) else str(place[top])
+    return f"{name}, the highest excess is {number(float(values[top]))} standard deviations at {where}"
+
+
+def _plan_alt(value: xr.DataArray, rx_position: np.ndarray, name: str) -> str:
+    worst = int(np.argmax(value.values))
+    x, y = rx_position[worst, :2]
+    median = number(float(np.median(value.values)))
+    return (
+        f"Plan view, {_WHEN[name].lower()}: {value.size} links, median excess {median} nats, "
+        f"worst {number(float(value.values[worst]))} nats at x {x:.1f} m, y {y:.1f} m."
+    )
+
+
+def all_charts(report: Report, gap: xr.DataTree | None) -> Iterator[tuple[str, Chart]]:
+    """Every figure of the page with the section it belongs to."""
+    yield from (("coordinates", chart) for chart in coordinate_charts(report, gap))
+    if report["verdict"] == "NO_GAP":  # bars and colours would make noise look like a finding
+        return
+    yield from (("plan", chart) for chart in plan_charts(report, gap))
+    yield "far", gap_chart(report)
+    closing = closing_chart(report)
+    if closing is not None:
+        yield "far", closing

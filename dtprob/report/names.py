@@ -1,0 +1,183 @@
+"""Names and numbers of a report as people say them: effects, sites, sizes, blocks of the data."""
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from dtprob.report.advice import family
+from dtprob.report.json_schema import Cause, Coordinates, Detectable, Interval, Site, Size
+from dtprob.report.units import (
+    Reading,
+    decimals_for,
+    number,
+    percent,
+    quantity,
+    reading,
+    scale_for,
+    split_unit,
+    with_unit,
+)
+
+_CAPITALS = {
+    "iq": "I/Q",
+    "ack": "ACK",
+    "nmse": "NMSE",
+    "rx": "receive",
+    "tx": "transmit",
+    "rsrp": "RSRP",
+    "snr": "SNR",
+    "csi": "CSI",
+}
+_SITES = {
+    "path_gain": "path gains",
+    "path_delay": "path delays",
+    "path_phase": "path phases",
+    "departure": "directions of departure",
+    "arrival": "directions of arrival",
+    "tx_response": "transmit antenna responses",
+    "rx_response": "receive antenna responses",
+    "noiseless_channel": "channel as a whole",
+    "noise_power": "noise level",
+}
+
+LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class DetectableFamily:
+    """What would have been seen of one family: the size of its least visible instance, and their count."""
+
+    name: str
+    parameter: str
+    size: str
+    count: int
+
+
+def words(name: str) -> str:
+    """A code name as words: ``iq_imbalance`` is "I/Q imbalance", ``gain[rx_2]`` is "gain (rx 2)"."""
+    stem, _, instance = name.partition("[")
+    text = " ".join(_CAPITALS.get(word, word) for word in stem.split("_"))
+    return f"{text} ({instance.rstrip(']').replace('_', ' ')})" if instance else text
+
+
+def site_words(site: str) -> str:
+    """A site of a model as words."""
+    return _SITES.get(site, words(site))
+
+
+def spoken(text: str, codes: Iterable[str]) -> str:
+    """The text with code names (those with an underscore or an instance) replaced by words."""
+    found = sorted((code for code in codes if "_" in code or "[" in code), key=len, reverse=True)
+    pattern = "|".join(rf"(?<!\w){re.escape(code)}(?![\w\[])" for code in found)
+    return re.sub(pattern, lambda match: words(match[0]), text) if found else text
+
+
+def listing(items: Iterable[str], last: str = "and") -> str:
+    """`a, b and c`."""
+    texts = list(items)
+    return f"{', '.join(texts[:-1])} {last} {texts[-1]}" if len(texts) > 1 else "".join(texts)
+
+
+def together(effects: Iterable[str]) -> str:
+    """A set of effects as words."""
+    return listing(words(effect) for effect in effects)
+
+
+def capital(text: str) -> str:
+    """The text with a capital first letter."""
+    return text[:1].upper() + text[1:]
+
+
+def size_reading(name: str, size: Size) -> tuple[str, Reading]:
+    """The words for a parameter and its size in human units."""
+    owner, _, parameter = _stem(name, size).rpartition(".")
+    if size.get("unit", "").startswith("Np"):  # shown in dB, which says that it is a logarithm
+        parameter = parameter.removeprefix("log_")
+    label = words(parameter) if not owner else f"{words(owner)}: {words(parameter)}"
+    return label, reading(size["mean"], size["low"], size["high"], _unit(name, size))
+
+
+def apart(name: str, size: Size, estimates: Sequence[float]) -> str:
+    """Estimates of one parameter from several parts of the data, in the unit of its size."""
+    scale = scale_for([size["mean"], size["low"], size["high"], *estimates], _unit(name, size))
+    decimals = decimals_for(scale(size["high"]) - scale(size["low"]))
+    return with_unit(listing(number(scale(value), decimals) for value in estimates), scale.unit)
+
+
+def shares(interval: Interval) -> str:
+    """An interval of shares: `88 to 97%`."""
+    return f"{percent(max(interval['low'], 0.0)).rstrip('%')} to {percent(interval['high'])}"
+
+
+def significant[Located: (Site, Coordinates)](located: Iterable[Located]) -> list[Located]:
+    """The sites or blocks whose share of the gap is hardly chance."""
+    return [entry for entry in located if entry["p_value"] <= LEVEL]
+
+
+def term(name: str) -> str:
+    """What a number in the user's own terms is called."""
+    stem = split_unit(name)[0]
+    if stem.endswith("_nmse"):
+        return f"{words(stem.removesuffix('_nmse'))} error (NMSE)"
+    return words(stem)
+
+
+def user_terms(name: str, before: float, after: float | None) -> list[str]:
+    """Numbers in the user's own terms before and after (where there is an after), in one unit."""
+    values = [before] if after is None else [before, after]
+    unit = split_unit(name)[1]
+    scale = scale_for(values, unit)
+    decimals = 1 if unit == "dB" else decimals_for(abs(scale(values[-1]) - scale(values[0])))
+    return [with_unit(number(scale(value), decimals), scale.unit) for value in values]
+
+
+def detail(value: Any) -> str:
+    """A value of an open entry of the report, as text on one line."""
+    if isinstance(value, Mapping):
+        return ", ".join(f"{name} {detail(entry)}" for name, entry in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(detail(entry) for entry in value)
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def block(entry: Coordinates) -> str:
+    """A block of the data: `rx antenna 0 to 1, subcarrier 40 to 63`."""
+    return ", ".join(
+        f"{words(axis)} {low:.6g}" + ("" if low == high else f"\u00a0to\u00a0{high:.6g}")
+        for axis, (low, high) in entry["axes"].items()
+    )
+
+
+def detectable_families(entries: Iterable[Detectable]) -> list[DetectableFamily]:
+    """For each family and unit the size from which every instance would have been seen."""
+    groups: dict[tuple[str, str, str], list[Detectable]] = {}
+    for entry in entries:
+        key = (family(entry["effect"]), entry.get("parameter", ""), entry.get("unit", "1"))
+        groups.setdefault(key, []).append(entry)
+    return [
+        DetectableFamily(
+            words(name),
+            words(parameter),
+            quantity(max(entry["size"] for entry in group), unit, 2),
+            len(group),
+        )
+        for (name, parameter, unit), group in groups.items()
+    ]
+
+
+def aliases(cause: Cause) -> list[list[str]]:
+    """The sets of effects that the data cannot tell from the cause, without the cause itself."""
+    return [other for other in cause["alias_class"] if sorted(other) != sorted(cause["effects"])]
+
+
+def _stem(name: str, size: Size) -> str:
+    """The key of a size without the unit at its end: `delay_s`, `velocity_m_per_s`."""
+    if "unit" not in size:
+        return split_unit(name)[0]
+    unit = size["unit"].replace("/", "_per_").replace("^", "").replace(" ", "_")
+    return name[: -len(unit) - 1] if name.lower().endswith(f"_{unit.lower()}") else name
+
+
+def _unit(name: str, size: Size) -> str:
+    return size.get("unit", split_unit(name)[1])

@@ -1,0 +1,119 @@
+"""The page that tells a diagnosis: one HTML file that needs nothing else."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import xarray as xr
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from dtprob.report import names, units
+from dtprob.report.charts import all_charts
+from dtprob.report.json_schema import Candidate, Interval, validate
+from dtprob.report.palette import DARK, LIGHT
+from dtprob.report.story import next_step, rivals, tell
+
+FIRST = 12
+
+
+@dataclass(frozen=True)
+class Bar:
+    """An interval on a track that contains zero: positions in percent of the track."""
+
+    low: float
+    high: float
+    mean: float
+    zero: float
+
+
+def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) -> str:
+    """The page of a diagnosis, as self-contained HTML.
+
+    Args:
+        report: the content of report.json.
+        gap: the content of gap.nc, for maps and plan views; each of its groups and variables may be absent.
+        title: what was diagnosed, for the page's heading.
+
+    Returns:
+        the text of an HTML file: no script, no request, readable on a telephone, in the dark and on paper.
+
+    Raises:
+        InputError: the report does not keep to `dtprob.report.json_schema.Report`.
+    """
+    checked = validate(report)
+    charts = list(all_charts(checked, gap))
+    return (
+        _environment()
+        .get_template("page.html.jinja")
+        .render(
+            title=title,
+            report=checked,
+            story=tell(checked),
+            next_step=next_step(checked),
+            rivals=rivals(checked),
+            charts={section: [chart for name, chart in charts if name == section] for section, _ in charts},
+            candidates=ranked(checked.get("screening", [])),
+            detectable=names.detectable_families(checked["detectable"]),
+            light=LIGHT,
+            dark=DARK,
+            first=FIRST,
+        )
+    )
+
+
+def bar(size: Interval) -> Bar:
+    """Where an interval lies on a track that also shows zero, with a margin at both ends."""
+    low, high = min(size["low"], size["mean"], 0.0), max(size["high"], size["mean"], 0.0)
+    span = (high - low) or 1.0
+    low, span = low - 0.06 * span, 1.12 * span
+    place = [round(100 * (value - low) / span, 2) for value in (size["low"], size["high"], size["mean"], 0.0)]
+    return Bar(place[0], place[1], place[2], place[3])
+
+
+def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
+    """The candidates from the most to the least significant; those that could not be tested come last."""
+
+    def rank(candidate: Candidate) -> tuple[float, float]:
+        adjusted, z = candidate["adjusted_p_value"], candidate["z"]
+        return (2.0 if adjusted is None else adjusted, 0.0 if z is None else -abs(z))
+
+    return sorted(candidates, key=rank)
+
+
+def _environment() -> Environment:
+    environment = Environment(
+        loader=PackageLoader("dtprob.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters |= {function.__name__: function for function in _FILTERS}
+    environment.globals |= {function.__name__: function for function in _FUNCTIONS}
+    return environment
+
+
+_FILTERS: tuple[Callable[..., Any], ...] = (
+    units.percent,
+    units.chance,
+    units.p_value,
+    units.number,
+    names.words,
+    names.site_words,
+    names.together,
+    names.listing,
+    names.capital,
+    names.block,
+    names.aliases,
+    names.term,
+    names.shares,
+    names.significant,
+    names.detail,
+    bar,
+)
+_FUNCTIONS: tuple[Callable[..., Any], ...] = (
+    names.size_reading,
+    names.user_terms,
+    names.apart,
+    units.reading,
+)

@@ -1,0 +1,219 @@
+"""A verdict in plain words: what was found, what it means for the twin, what to do."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+from dtprob.report.advice import ADVICE, family
+from dtprob.report.json_schema import Cause, Detectable, Report
+from dtprob.report.names import (
+    aliases,
+    capital,
+    detail,
+    detectable_families,
+    listing,
+    shares,
+    significant,
+    site_words,
+    size_reading,
+    spoken,
+    together,
+    words,
+)
+from dtprob.report.units import percent
+
+
+@dataclass(frozen=True)
+class Story:
+    """A verdict as the page tells it; the tone is the name of a colour."""
+
+    label: str
+    tone: str
+    headline: str
+    meaning: str
+    action: str
+
+
+def rivals(report: Report) -> list[list[str]]:
+    """The sets of effects that compete for the first place: the first, its aliases, other likely ones."""
+    if not report["causes"]:
+        return []
+    first = report["causes"][0]
+    likely = [cause["effects"] for cause in report["causes"][1:] if cause["probability"] >= 0.05]
+    found: list[list[str]] = []
+    for effects in [first["effects"], *first["alias_class"], *likely]:
+        if sorted(effects) not in [sorted(other) for other in found]:
+            found.append(effects)
+    return found
+
+
+def next_step(report: Report) -> str | None:
+    """The next measurement as one sentence, or None where there is none.
+
+    Besides text it may be a mapping with a `description`, or with a `design` (coordinates) and its `repeats`.
+    """
+    plan = report["next_measurement"]
+    if not isinstance(plan, Mapping):
+        return plan
+    if "design" not in plan:
+        return plan.get("description")
+    times = plan.get("repeats", 1)
+    where = listing(f"{words(axis)} {detail(value)}" for axis, value in plan["design"].items())
+    many = f" {times} times" if times > 1 else ""
+    return f"Measure {where} again{many}: there the explanations differ most."
+
+
+def tell(report: Report) -> Story:
+    """The story of a report's verdict; its headline is the report's own summary where it has one."""
+    story = _STORIES[report["verdict"]](report)
+    headline = spoken(report["summary"], _codes(report)) if "summary" in report else story.headline
+    return replace(story, headline=headline)
+
+
+def _codes(report: Report) -> set[str]:
+    """All names of effects and sites that the report holds."""
+    sets = [effects for cause in report["causes"] for effects in (cause["effects"], *cause["alias_class"])]
+    screened = report.get("screening", [])
+    located = [*report["where"]["sites"], *report["unlisted"]["sites"]]
+    return {
+        *(effect for effects in sets for effect in effects),
+        *(row["effect"] for row in screened),
+        *(site for row in screened for site in row["sites"]),
+        *(site if isinstance(site, str) else site["site"] for site in located),
+    }
+
+
+def _no_gap(report: Report) -> Story:
+    count = len(report.get("screening", []))
+    tried = f"{count} known effects were tried" if count else "The known effects were tried"
+    return Story(
+        "No gap found",
+        "good",
+        "Nothing found: the twin agrees with the data.",
+        f"{tried}; none of them is needed to explain these data, and nothing else was left over. "
+        f"{_seen(report['detectable'])}",
+        "Nothing to change in the twin.",
+    )
+
+
+def _seen(detectable: list[Detectable]) -> str:
+    if not detectable:
+        return "How large an effect would have been seen is not known."
+    some = [f"{entry.name} of {entry.size}" for entry in detectable_families(detectable)[:3]]
+    return (
+        f"Effects larger than these would have been seen: {listing(some)}. Smaller ones cannot be ruled out."
+    )
+
+
+def _listed(report: Report) -> Story:
+    cause = report["causes"][0]
+    return Story(
+        "Cause found",
+        "found",
+        f"The gap comes from {_named(cause)}.",
+        f"{_closing(cause)} What is left is no more than chance.{_looks_alike(cause)}",
+        _change(cause),
+    )
+
+
+def _remainder(report: Report) -> Story:
+    cause = report["causes"][0]
+    return Story(
+        "Cause found, but something is left",
+        "partly",
+        f"Part of the gap comes from {_named(cause)}. No known effect explains the rest.",
+        f"{_closing(cause)} What is left is real{_seat(report)}.{_looks_alike(cause)}",
+        f"{_change(cause)} The twin will be closer but not right.",
+    )
+
+
+def _unlisted(report: Report) -> Story:
+    return Story(
+        "Cause unknown",
+        "unknown",
+        "There is a gap, and none of the known effects explains it.",
+        f"The difference between twin and data is real{_seat(report)}, but every effect in the library "
+        "was tried, and something remains with each.",
+        "Do not add a listed effect: it would hide the problem, not solve it. Look for physics that the twin "
+        "lacks where the gap lies, and declare it as a new effect.",
+    )
+
+
+def _undetermined(report: Report) -> Story:
+    names = [together(effects) for effects in rivals(report)]
+    step = next_step(report)
+    wait = f" First: {step[:1].lower() + step[1:].rstrip('.')}." if step else ""
+    if len(names) > 1:
+        headline = f"There is a gap, but the data cannot tell {listing(names, 'from')}."
+        meaning = (
+            "The gap is real, and each of these explanations fits the data about equally well. "
+            "Choosing one now would be a guess."
+        )
+    else:
+        signs = f"signs of {names[0]}" if names else "signs of a gap"
+        headline = f"There are {signs}, but the data do not confirm them."
+        meaning = (
+            "What was found in one part of the data did not hold in the part that was kept apart. "
+            "It may be chance, or an effect too small for this amount of data; "
+            "more data of the same kind would decide."
+        )
+    return Story("Cause undecided", "partly", headline, meaning, f"Do not change the twin yet.{wait}")
+
+
+def _named(cause: Cause) -> str:
+    """`one effect: timing offset`, or so."""
+    count = len(cause["effects"])
+    same = ", or what looks the same in these data" if aliases(cause) else ""
+    return f"{_COUNTS.get(count, str(count))} effect{'s' * (count > 1)}: {together(cause['effects'])}{same}"
+
+
+def _looks_alike(cause: Cause) -> str:
+    """Which effects cannot be told apart; what both sides share is left out."""
+    pairs: list[str] = []
+    for other in aliases(cause):
+        mine = [effect for effect in cause["effects"] if effect not in other] or cause["effects"]
+        theirs = [effect for effect in other if effect not in cause["effects"]] or other
+        pairs.append(f"{together(mine)} from {together(theirs)}")
+    return f" These data cannot tell {listing(pairs, 'or')}." if pairs else ""
+
+
+def _closing(cause: Cause) -> str:
+    closed = cause["closed_fraction"]
+    if closed is None:
+        return "How much of the gap this closes could not be established."
+    return (
+        f"Added to the twin, this closes {percent(closed['mean'])} of the gap "
+        f"(90% interval {shares(closed)}) on data that were not used to find it."
+    )
+
+
+def _change(cause: Cause) -> str:
+    changes = "; ".join(advice(effect) for effect in cause["effects"])
+    sizes = [size_reading(*item) for item in cause["size"].items()]
+    if len(sizes) == 1:
+        estimate = f" Estimate: {sizes[0][0]} {sizes[0][1]}."
+    else:
+        shown = listing(f"{label} {value.mean_with_unit}" for label, value in sizes[:4]) if sizes else ""
+        estimate = f" Estimates: {shown}." if 1 < len(sizes) <= 4 else ""
+    return f"{capital(changes)}.{estimate}"
+
+
+def advice(effect: str) -> str:
+    """What to do about an effect, as an imperative without capital and full stop."""
+    return ADVICE.get(family(effect), f"add {words(effect)}, with its estimated size, to the twin")
+
+
+def _seat(report: Report) -> str:
+    """` (in the path delays)`, where the remainder or the gap was located."""
+    left = [site if isinstance(site, str) else site["site"] for site in report["unlisted"]["sites"]]
+    sites = left or [site["site"] for site in significant(report["where"]["sites"])[:1]]
+    return f" and lies in the {listing(site_words(site) for site in sites[:2])}" if sites else ""
+
+
+_COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}
+_STORIES: Mapping[str, Callable[[Report], Story]] = {
+    "NO_GAP": _no_gap,
+    "LISTED": _listed,
+    "LISTED_WITH_REMAINDER": _remainder,
+    "UNLISTED": _unlisted,
+    "UNDETERMINED": _undetermined,
+}

@@ -1,0 +1,115 @@
+"""Words for names, sizes and verdicts."""
+
+from dtprob.report import names
+from dtprob.report.advice import ADVICE, family
+from dtprob.report.json_schema import Cause
+from dtprob.report.page import bar, ranked
+from dtprob.report.story import advice, next_step
+
+
+def _cause(*effects: str, alias: list[list[str]] | None = None) -> Cause:
+    return {
+        "effects": list(effects),
+        "alias_class": alias or [list(effects)],
+        "probability": 1.0,
+        "size": {},
+        "closed_fraction": None,
+    }
+
+
+def test_only_what_is_hardly_chance_is_located() -> None:
+    sites: list[names.Site] = [{"site": s, "p_value": p, "share": 1.0} for s, p in (("a", 0.2), ("b", 0.01))]
+    assert [site["site"] for site in names.significant(sites)] == ["b"]
+
+
+def test_names_become_words() -> None:
+    assert names.words("iq_imbalance") == "I/Q imbalance"
+    assert names.words("object_displacement[building_2]") == "object displacement (building 2)"
+    assert names.together(["a_b", "c", "ack_loss"]) == "a b, c and ACK loss"
+    assert names.listing([]) == ""
+    assert names.site_words("arrival") == "directions of arrival"
+    assert names.site_words("my_site") == "my site"
+    assert names.term("channel_nmse_db") == "channel error (NMSE)"
+
+
+def test_aliases_leave_the_cause_out() -> None:
+    assert names.aliases(_cause("a", "b", alias=[["b", "a"], ["c"]])) == [["c"]]
+
+
+def test_user_terms_share_unit_and_decimals() -> None:
+    assert names.user_terms("throughput", 0.845, 0.912) == ["0.845", "0.912"]
+    assert names.user_terms("channel_nmse_db", -3.14, -17.8) == ["−3.1\u202fdB", "−17.8\u202fdB"]
+    assert names.user_terms("delay_s", 1e-9, None) == ["1.00\u202fns"]
+
+
+def test_estimates_of_strata_share_the_unit_of_the_size() -> None:
+    shown = names.apart("delay_s", {"mean": 1e-9, "low": 0.9e-9, "high": 1.1e-9}, [0.98e-9, 1.03e-9])
+    assert shown == "0.98 and 1.03\u202fns"
+
+
+def test_detectable_sizes_of_a_family_are_its_worst() -> None:
+    entries: list[names.Detectable] = [
+        {"effect": "shift[a]", "size": 0.02, "unit": "m"},
+        {"effect": "shift[b]", "size": 0.05, "unit": "m"},
+        {"effect": "other", "size": 0.1},
+    ]
+    first, second = names.detectable_families(entries)
+    assert (first.name, first.size, first.count) == ("shift", "5.0\u202fcm", 2)
+    assert (second.name, second.size, second.count) == ("other", "0.10", 1)
+
+
+def test_sizes_drop_the_unit_of_their_key() -> None:
+    interval = {"mean": 0.1, "low": 0.05, "high": 0.15}
+    label, shown = names.size_reading("array_calibration[rx_1].log_gain_Np", {**interval, "unit": "Np"})
+    assert label == "array calibration (rx 1): gain"
+    assert (shown.mean, shown.unit) == ("0.87", "dB")
+    assert names.size_reading("velocity_x_m_per_s", {**interval, "unit": "m/s"})[0] == "velocity x"
+    assert names.size_reading("scale_rad_per_s0.5", {**interval, "unit": "rad/s^0.5"})[0] == "scale"
+    assert names.size_reading("delay_s", interval)[0] == "delay"
+
+
+def test_code_names_in_sentences_become_words() -> None:
+    codes = ["path_delay", "arrival", "shift_all", "shift_all[wall_2]", "my_shift_all"]
+    said = names.spoken(
+        "It is shift_all[wall_2] or shift_all at path_delay on arrival (my_shift_all).", codes
+    )
+    assert said == "It is shift all (wall 2) or shift all at path delay on arrival (my shift all)."
+    assert names.spoken("plain", []) == "plain"
+
+
+def test_next_step_is_made_from_a_design() -> None:
+    plan = {"split": [["a"], ["b"]], "design": {"link": 17}, "gain_nats": 0.25, "repeats": 12}
+    report: names.Any = {"next_measurement": plan}
+    assert next_step(report) == "Measure link 17 again 12 times: there the explanations differ most."
+    report = {"next_measurement": "Do it."}
+    assert next_step(report) == "Do it."
+
+
+def test_advice_reads_as_an_imperative() -> None:
+    assert family("blockage[wall_3]") == "blockage"
+    assert advice("blockage[wall_3]") == ADVICE["blockage"]
+    assert "new_effect" not in ADVICE
+    assert advice("new_effect[2]") == "add new effect (2), with its estimated size, to the twin"
+    for text in ADVICE.values():
+        assert text[0].islower()
+        assert not text.endswith(".")
+
+
+def test_a_bar_shows_zero_and_the_whole_interval() -> None:
+    for low, mean, high in ((1.0, 2.0, 3.0), (-3.0, -2.0, -1.0), (-1.0, 0.5, 2.0), (0.0, 0.0, 0.0)):
+        place = bar({"low": low, "mean": mean, "high": high})
+        assert 0 <= place.low <= place.mean <= place.high <= 100
+        assert 0 <= place.zero <= 100
+
+
+def test_candidates_are_ranked_and_untested_ones_come_last() -> None:
+    def row(effect: str, z: float | None, p: float | None) -> names.Any:
+        return {"effect": effect, "sites": [], "z": z, "p_value": p, "adjusted_p_value": p}
+
+    rows = [
+        row("none", None, None),
+        row("weak", 1.0, 1.0),
+        row("strong", -9.0, 1e-9),
+        row("medium", 2.0, 1.0),
+    ]
+    assert [candidate["effect"] for candidate in ranked(rows)] == ["strong", "medium", "weak", "none"]
