@@ -1,0 +1,284 @@
+"""A CASE: the TOML file that says which model, data, effects and engine belong together."""
+
+import os
+import tomllib
+from collections.abc import Mapping
+from dataclasses import MISSING, dataclass, field, fields, replace
+from pathlib import Path
+from typing import Any, Literal, cast, get_type_hints
+
+from dtprob.errors import InputError, unknown_name
+
+type Phase = Literal["coherent", "per_packet", "none"]
+type Options = Mapping[str, Any]
+
+PHASES: tuple[Phase, ...] = ("coherent", "per_packet", "none")
+
+
+@dataclass(frozen=True, kw_only=True)
+class ModelSection:
+    """[model]: the generative model.
+
+    Attributes:
+        name: a model of dtprob, or "package.module:function" of the user's own.
+        options: settings of the model, by the names of its arguments.
+    """
+
+    name: str
+    options: Options = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class DataSection:
+    """[data]: what was measured.
+
+    Attributes:
+        file: the data file.
+        reference: earlier data from which the twin was learned; its posterior is the prior of a diagnosis.
+        phase: what the phases of the data mean; "coherent" unless said.
+        cluster: the column or axis whose values belong together; the model's own unless said.
+        options: settings of the reader, for data that have some.
+    """
+
+    file: Path
+    reference: Path | None = None
+    phase: Phase | None = None
+    cluster: str | None = None
+    options: Options = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SceneSection:
+    """[scene]: the geometry of ray-traced models.
+
+    Attributes:
+        file: a scene that sionna-rt ships, the path of a Mitsuba XML file, of a path set (.nc), or of a floor
+            plan (.json, also "data set/floorplan.json" of a measured set).
+        frequency: carrier, Hz; a path set knows its own.
+        max_depth: most interactions on a path.
+        refraction, diffraction, diffuse_reflection: what the twin traces besides specular reflection.
+        tx_pattern, rx_pattern, polarization: of the antenna elements, as sionna-rt names them.
+        merge_shapes: whether objects of one material become one; false keeps every object apart.
+        device_height: m, added to the height of both ends of each link.
+        ceiling_height: m, of the rooms of a floor plan.
+        wall_material, wall_thickness: of the walls of a floor plan; thickness in m.
+    """
+
+    file: str
+    frequency: float | None = None
+    max_depth: int = 3
+    refraction: bool = False
+    diffraction: bool = False
+    diffuse_reflection: bool = False
+    tx_pattern: str = "iso"
+    rx_pattern: str = "iso"
+    polarization: str = "V"
+    merge_shapes: bool = True
+    device_height: float | None = None
+    ceiling_height: float | None = None
+    wall_material: str = "brick"
+    wall_thickness: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EffectsSection:
+    """[effects]: the candidate causes.
+
+    Attributes:
+        use: "all", names, or "package.module:effects" of the user's own.
+        exclude: names of families or instances that are left out of these.
+    """
+
+    use: str | tuple[str, ...] = "all"
+    exclude: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineSection:
+    """[engine]: the inference engine.
+
+    Attributes:
+        name: its name.
+        options: its settings.
+    """
+
+    name: str = "laplace"
+    options: Options = field(default_factory=dict)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SeedSection:
+    """[seed]: where randomness starts.
+
+    Attributes:
+        value: a whole number from 0.
+    """
+
+    value: int = 0
+
+
+@dataclass(frozen=True, kw_only=True)
+class Case:
+    """A checked CASE; every path in it is complete.
+
+    Attributes:
+        path: the TOML file.
+        model, data, scene, effects, engine, seed: its sections; scene is None where there is none.
+    """
+
+    path: Path
+    model: ModelSection
+    data: DataSection
+    scene: SceneSection | None = None
+    effects: EffectsSection = field(default_factory=EffectsSection)
+    engine: EngineSection = field(default_factory=EngineSection)
+    seed: SeedSection = field(default_factory=SeedSection)
+
+    @property
+    def folder(self) -> Path:
+        """Where the TOML file lies, and the user's own modules beside it."""
+        return self.path.parent
+
+    @property
+    def user_code(self) -> tuple[str, ...]:
+        """The user's own functions that this case runs, as "module:name"."""
+        use = self.effects.use
+        named = [self.model.name, *((use,) if isinstance(use, str) else use)]
+        return tuple(name for name in named if ":" in name)
+
+
+_SECTIONS: dict[str, type] = {
+    "model": ModelSection,
+    "data": DataSection,
+    "scene": SceneSection,
+    "effects": EffectsSection,
+    "engine": EngineSection,
+    "seed": SeedSection,
+}
+
+
+def load_case(path: str | os.PathLike[str]) -> Case:
+    """Read and check a CASE file.
+
+    Args:
+        path: a TOML file.
+
+    Raises:
+        InputError: no such file, not TOML, an unknown section or key (the nearest valid one is named), a
+            missing key, a value of the wrong type or out of range.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(str(path), "a CASE file (TOML)", "no such file", "Check the name and the folder")
+    try:
+        document = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "a TOML file", str(error), "Correct the file there") from None
+    return parse_case(document, path)
+
+
+def parse_case(document: Mapping[str, Any], path: Path) -> Case:
+    """Check the content of a CASE file.
+
+    Args:
+        document: the sections as TOML gives them.
+        path: where it came from; paths inside are relative to its folder.
+
+    Raises:
+        InputError: as ``load_case``.
+    """
+    sections: dict[str, Any] = {}
+    for name, content in document.items():
+        if name not in _SECTIONS:
+            raise unknown_name(path.name, name, _SECTIONS, "section")
+        if not isinstance(content, Mapping):
+            raise InputError(
+                f"{path.name} {name}", f"a section [{name}]", _shown(content), "Write it as a section"
+            )
+        sections[name] = _section(
+            cast("Mapping[str, Any]", content), _SECTIONS[name], f"{path.name} [{name}]"
+        )
+    for name, key in (("model", "name"), ("data", "file")):
+        if name not in sections:
+            raise InputError(path.name, f"a section [{name}]", "none", f"Add [{name}] with at least '{key}'")
+    return _resolved(Case(path=path.absolute(), **sections))
+
+
+def _section(content: Mapping[Any, Any], kind: type, where: str) -> Any:
+    hints = get_type_hints(kind)
+    for key in content:
+        if key not in hints:
+            raise unknown_name(where, key, hints, "key")
+    for entry in fields(kind):
+        if entry.name not in content and entry.default is entry.default_factory is MISSING:
+            raise InputError(where, f"a key '{entry.name}'", "none", f"Add {entry.name} = ...")
+    return kind(**{key: _value(content[key], hints[key], f"{where} {key}") for key in content})
+
+
+def _value(value: Any, hint: Any, where: str) -> Any:
+    expected, accepts = _KINDS[hint]
+    if not accepts(value):
+        raise InputError(where, expected, _shown(value), "Correct the value")
+    return _CONVERT.get(hint, lambda kept: kept)(value)
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool)
+
+
+def _is_whole(value: Any) -> bool:
+    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+
+
+def _is_text(value: Any) -> bool:
+    return isinstance(value, str) and bool(value)
+
+
+def _is_names(value: Any) -> bool:
+    return _is_text(value) or (isinstance(value, list) and all(map(_is_text, cast("list[Any]", value))))
+
+
+_KINDS: dict[Any, tuple[str, Any]] = {
+    str: ("text", _is_text),
+    str | None: ("text", _is_text),
+    Path: ("the name of a file", _is_text),
+    Path | None: ("the name of a file", _is_text),
+    int: ("a whole number from 0", _is_whole),
+    float | None: ("a positive number", lambda value: _is_number(value) and 0 < value < float("inf")),
+    bool: ("true or false", lambda value: isinstance(value, bool)),
+    str | tuple[str, ...]: ("'all', a list of names, or 'module:name'", _is_names),
+    tuple[str, ...]: ("a list of names", lambda value: isinstance(value, list) and _is_names(value)),
+    Options: ("a table of settings", lambda value: isinstance(value, Mapping)),
+    Phase | None: (f"one of {', '.join(PHASES)}", lambda value: value in PHASES),
+}
+"""For each type of a field: what it is in words, and the test for it."""
+
+_CONVERT: dict[Any, Any] = {
+    Path: Path,
+    Path | None: Path,
+    float | None: float,
+    str | tuple[str, ...]: lambda value: value if isinstance(value, str) else tuple(value),
+    tuple[str, ...]: tuple,
+    Options: dict,
+}
+
+
+def _shown(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def _resolved(case: Case) -> Case:
+    """The case with its paths made complete."""
+    reference = case.data.reference
+    data = replace(
+        case.data, file=case.folder / case.data.file, reference=reference and case.folder / reference
+    )
+    scene = case.scene
+    if scene is not None:
+        is_path = Path(scene.file).suffix.lower() in {".xml", ".nc", ".json"}
+        scene = replace(scene, file=str(case.folder / scene.file) if is_path else scene.file)
+        if scene.frequency is None and Path(scene.file).suffix.lower() != ".nc":
+            where = f"{case.path.name} [scene]"
+            raise InputError(where, "a key 'frequency'", "none", "Add frequency = ..., the carrier in Hz")
+    return replace(case, data=data, scene=scene)

@@ -1,0 +1,144 @@
+"""The command line. Nothing heavy is imported here, so that help comes at once."""
+
+import argparse
+import importlib
+import os
+import signal
+import sys
+import traceback
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NoReturn
+
+from dtprob import __version__
+from dtprob.case import load_case
+from dtprob.errors import InputError, nearest
+from dtprob.reproduce import FIGURES
+from dtprob.xla import avoid_miscompilation
+
+DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+
+COMMANDS = {
+    "demo": "dtprob.commands.demo",
+    "fit": "dtprob.commands.fit",
+    "diagnose": "dtprob.commands.diagnose",
+    "reproduce": "dtprob.commands.reproduce",
+    "list": "dtprob.commands.listing",
+    "doctor": "dtprob.commands.doctor",
+}
+"""For each command, the module whose `run` does it; it gets the command's options by name."""
+
+
+class Parser(argparse.ArgumentParser):
+    """Answers a mistake with one line that says what to do."""
+
+    def error(self, message: str) -> NoReturn:
+        """Say what is wrong, the nearest valid word or where to look, and leave with status 2."""
+        remedy = self._guess(message) or f"See `{self.prog} --help`."
+        sys.stderr.write(f"dtprob: {message}. {remedy}\n")
+        raise SystemExit(WRONG_INPUT)
+
+    def _guess(self, message: str) -> str | None:
+        """Ask for the valid word nearest to a wrong one."""
+        if "invalid choice: " in message:
+            wrong = message.split("'")[1]
+        elif "unrecognized arguments: " in message:
+            wrong = message.split("arguments: ")[1].split(maxsplit=1)[0]
+        else:
+            return None
+        known: list[str] = []
+        for action in self._actions:
+            known += [*action.option_strings, *(action.choices or ())]
+        close = nearest(wrong, known)
+        return f"Did you mean '{close}'?" if close else None
+
+
+def parser() -> Parser:
+    """The grammar of the command line."""
+    top = Parser(
+        prog="dtprob",
+        description="Digital twins of wireless systems: fit a twin to data, and find out why they differ.",
+        epilog="Exit status: 0 done, 1 the job failed, 2 wrong input.",
+    )
+    top.add_argument("--version", action="version", version=f"dtprob {__version__}")
+    commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
+
+    def add(name: str, text: str) -> argparse.ArgumentParser:
+        added = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
+        added.add_argument("--debug", action="store_true", help="show the traceback of an error")
+        return added
+
+    _add_out(add("demo", "diagnose recorded measurements, without any set-up: report.html"))
+    _add_case(add("fit", "infer a twin's parameters from data: posterior.nc, summary.json"))
+    _add_case(add("diagnose", "find out why data differ from a twin: report.html, report.json, gap.nc"))
+    figure = add("reproduce", "make a figure of the seed report: FIGURE.json, FIGURE.png")
+    figure.add_argument("figure", choices=tuple(FIGURES), metavar="FIGURE", help=", ".join(FIGURES))
+    _add_out(figure)
+    figure.add_argument("--runs", type=int, metavar="N", help="runs, instead of the figure's own number")
+    figure.add_argument("--seed", type=int, default=0, metavar="S", help="where randomness starts")
+    figure.add_argument("--resume", action="store_true", help="continue an interrupted run in the same DIR")
+    listing = add("list", "what there is to choose from")
+    listing.add_argument("what", choices=("models", "engines", "effects"))
+    listing.add_argument("--json", action="store_true", help="as JSON")
+    doctor = add("doctor", "what this machine can do, and how to get what is missing")
+    doctor.add_argument("--json", action="store_true", help="as JSON")
+    return top
+
+
+def _add_out(added: argparse.ArgumentParser) -> None:
+    added.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder for the results")
+
+
+def _add_case(added: argparse.ArgumentParser) -> None:
+    added.add_argument("case", type=Path, metavar="CASE", help="TOML file that names model, data, engine")
+    _add_out(added)
+    added.add_argument("--engine", metavar="NAME", help="inference engine, instead of the case's")
+    added.add_argument("--seed", type=int, metavar="S", help="seed, instead of the case's")
+    added.add_argument("--no-code", action="store_true", help="refuse a case that runs code of its own")
+    added.add_argument("--resume", action="store_true", help="continue an interrupted run in the same DIR")
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command.
+
+    Args:
+        arguments: the words after ``dtprob``; by default those of this process.
+
+    Returns:
+        the exit status: 0 done, 1 the job failed, 2 wrong input, 130 stopped by Ctrl-C.
+    """
+    options = vars(parser().parse_args(arguments))
+    command, debug = options.pop("command"), options.pop("debug")
+    signal.signal(signal.SIGTERM, _terminate)
+    avoid_miscompilation()
+    try:
+        if "case" in options:  # before anything heavy, so that a mistake in it shows at once
+            options["case"] = load_case(options["case"])
+        importlib.import_module(COMMANDS[command]).run(**options)
+    except KeyboardInterrupt:
+        resume = " Continue with the same command and --resume." if "resume" in options else ""
+        return _fail(INTERRUPTED, f"stopped.{resume}", debug=debug)
+    except BrokenPipeError:  # the reader of standard output has seen enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except InputError as error:
+        return _fail(WRONG_INPUT, str(error), debug=debug)
+    except Exception as error:  # noqa: BLE001  (the one place where any failure becomes one line)
+        text = f"{command} failed: {type(error).__name__}: {str(error) or 'no message'}"
+        return _fail(FAILED, f"{text.rstrip('.')}. See where with --debug.", debug=debug)
+    return DONE
+
+
+def _fail(status: int, text: str, *, debug: bool) -> int:
+    if debug:
+        traceback.print_exc()
+    sys.stderr.write(f"dtprob: {' '.join(text.split())}\n")
+    return status
+
+
+def _terminate(number: int, frame: object) -> NoReturn:
+    del number, frame
+    raise SystemExit(TERMINATED)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,67 @@
+"""`dtprob diagnose`: from a CASE to a report of why data and twin differ."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dtprob import __version__
+from dtprob.case import Case
+from dtprob.commands.run import Run, chosen, infer, prepare_case, session, write_text
+from dtprob.files import atomic_write
+from dtprob.gap.diagnose import diagnose
+from dtprob.report import render, to_json
+
+RESULTS = ("gap.nc", "report.html", "report.json")
+
+
+def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code: bool, resume: bool) -> None:
+    """Find out why the data of a case differ from its twin: gap.nc, report.html, then report.json.
+
+    Args:
+        case: what to diagnose.
+        out: the folder of the results.
+        engine: instead of the case's.
+        seed: instead of the case's.
+        no_code: refuse a case that runs the user's own code.
+        resume: keep what an earlier run of the same case left in ``out``: traced paths, the fit to the
+            reference.
+    """
+    with session() as say:
+        job = Run(out, resume, not no_code, say)
+        prepared = prepare_case(chosen(case, engine, seed), job, "diagnosis", RESULTS)
+        reference = None
+        if prepared.reference is not None:
+            say("learning the twin from the reference data")
+            reference = infer(prepared, prepared.reference, out / "reference.nc", job)
+        say(f"{len(prepared.effects)} candidate effects")
+        diagnosis = diagnose(
+            prepared.model,
+            prepared.data,
+            prepared.effects,
+            key=prepared.key,
+            engine=prepared.engine,
+            cluster=prepared.cluster,
+            reference=reference,
+            say=say,
+        )
+        report = diagnosis.to_report()
+        report["provenance"] = {**report.get("provenance", {}), "dtprob": __version__, **prepared.provenance}
+        title = f"{case.data.file.name} against {case.model.name}"
+        write_diagnosis(out, report, diagnosis.to_datatree(), title=title)
+        say(f"{report['verdict']}: {report.get('summary', '')}".rstrip(": "))
+        say(f"done: {out / 'report.html'}")
+
+
+def write_diagnosis(out: Path, report: Mapping[str, Any], gap: Any, *, title: str) -> None:
+    """Write gap.nc, report.html and, last, report.json.
+
+    Args:
+        out: the folder.
+        report: the content of report.json.
+        gap: an ``xarray.DataTree``, the content of gap.nc.
+        title: what was diagnosed.
+    """
+    with atomic_write(out / "gap.nc") as temporary:
+        gap.to_netcdf(temporary, engine="h5netcdf")
+    write_text(out / "report.html", render(report, gap, title=title))
+    write_text(out / "report.json", to_json(report))

@@ -1,0 +1,31 @@
+"""`dtprob fit`: from a CASE to a posterior."""
+
+import json
+from pathlib import Path
+
+from dtprob.case import Case
+from dtprob.commands.run import Run, chosen, infer, prepare_case, session, write_text
+from dtprob.workflow.summary import summarise
+
+
+def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code: bool, resume: bool) -> None:
+    """Infer the parameters of a case's model: posterior.nc, then summary.json.
+
+    Args:
+        case: what to fit.
+        out: the folder of the results.
+        engine: instead of the case's.
+        seed: instead of the case's.
+        no_code: refuse a case that runs the user's own code.
+        resume: continue from the checkpoint in ``out``.
+    """
+    with session() as say:
+        job = Run(out, resume, not no_code, say)
+        prepared = prepare_case(chosen(case, engine, seed), job, "fit", ("summary.json",))
+        posterior = infer(prepared, prepared.data, out / "posterior.nc", job)
+        summary = summarise(posterior)
+        summary["provenance"] |= prepared.provenance
+        write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
+        for warning in summary["warnings"]:
+            say(warning)
+        say(f"done: {out / 'posterior.nc'}, {out / 'summary.json'}")

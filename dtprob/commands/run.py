@@ -1,0 +1,140 @@
+"""What the commands that run a CASE share: the session, the overrides, the fit with its checkpoint."""
+
+import os
+import warnings
+from collections.abc import Generator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+
+from dtprob import __version__
+from dtprob.case import Case, EngineSection
+from dtprob.commands.progress import Say, telling
+from dtprob.errors import InputError
+from dtprob.files import atomic_write
+from dtprob.inference import Posterior, RunOptions
+from dtprob.workflow import Prepared, prepare
+from dtprob.workflow.prepare import sha256
+
+
+@dataclass(frozen=True)
+class Run:
+    """Where a command writes, and how.
+
+    Attributes:
+        out: the folder of the results.
+        resume: continue what an interrupted run left there.
+        allow_code: whether the user's own code may run.
+        say: tells the progress.
+    """
+
+    out: Path
+    resume: bool
+    allow_code: bool
+    say: Say
+
+
+def _cache_folder() -> Path:
+    """Where compiled programs are kept between commands; JAX_COMPILATION_CACHE_DIR says otherwise."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "dtprob" / "compiled"
+
+
+@contextmanager
+def session() -> Generator[Say]:
+    """Double precision, progress, and warnings told as plain lines, for the time of one command."""
+    jax.config.update("jax_enable_x64", True)
+    if jax.config.jax_compilation_cache_dir is None:
+        jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
+        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    with telling() as say, warnings.catch_warnings():
+        warnings.showwarning = lambda message, *_: say(f"note: {message}")
+        yield say
+
+
+def chosen(case: Case, engine: str | None, seed: int | None) -> Case:
+    """The case with what the command line says instead; another engine has its own default settings."""
+    if engine is not None:
+        same = engine == case.engine.name
+        case = replace(case, engine=case.engine if same else EngineSection(name=engine))
+    if seed is not None:
+        if seed < 0:
+            raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
+        case = replace(case, seed=replace(case.seed, value=seed))
+    return case
+
+
+def prepare_case(case: Case, run: Run, need: Literal["fit", "diagnosis"], results: Sequence[str]) -> Prepared:
+    """Everything ready to run; results of an earlier run in the same folder are gone.
+
+    Args:
+        case: the CASE.
+        run: where to write.
+        need: what is going to be done.
+        results: the names of the files that will be written.
+
+    Raises:
+        InputError: see ``dtprob.workflow.prepare``, or a folder that cannot be made.
+    """
+    if case.user_code and run.allow_code:
+        run.say(f"this case runs code of its own: {', '.join(case.user_code)}")
+    _make_folder(run.out)
+    prepared = prepare(case, need=need, allow_code=run.allow_code, cache=run.out, say=run.say)
+    for name in results:
+        (run.out / name).unlink(missing_ok=True)
+    return prepared
+
+
+def infer(prepared: Prepared, data: Mapping[str, Any], file: Path, run: Run) -> Posterior:
+    """The posterior given some data, kept in a file so that an interrupted run need not begin again.
+
+    Args:
+        prepared: model, engine and key.
+        data: the model's arguments.
+        file: where to keep the posterior; beside it lie, while it is being made, a checkpoint and a status.
+        run: whether to resume, and how to tell the progress.
+    """
+    identity = file.with_suffix(".identity")
+    if run.resume and file.is_file() and _read(identity) == _identity(prepared, file):
+        run.say(f"{file.name} is there already")
+        return Posterior.load(file)
+    checkpoint, status = file.with_suffix(".checkpoint"), file.with_suffix(".status.json")
+    options = RunOptions(
+        progress=True, status_file=status, checkpoint=checkpoint, resume=run.resume and checkpoint.is_file()
+    )
+    run.say(f"fitting with {prepared.engine.name}")
+    posterior = prepared.engine(prepared.key, prepared.model, data, options=options)
+    posterior.save(file)
+    write_text(identity, _identity(prepared, file))
+    for temporary in (checkpoint, status):
+        temporary.unlink(missing_ok=True)
+    return posterior
+
+
+def _identity(prepared: Prepared, file: Path) -> str:
+    """What a kept posterior depends on, as text."""
+    reference = prepared.case.data.reference
+    made_from = prepared.data_sha256 if file.stem == "posterior" or not reference else sha256(reference)
+    return f"dtprob {__version__}\n{prepared.engine!r}\n{prepared.case!r}\n{made_from}\n"
+
+
+def _read(file: Path) -> str | None:
+    return file.read_text(encoding="utf-8") if file.is_file() else None
+
+
+def _make_folder(out: Path) -> None:
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"--out {out}", "a folder", error.strerror or str(error), "Choose another folder"
+        ) from None
+
+
+def write_text(path: Path, text: str) -> None:
+    """Write text to a file, whole or not at all."""
+    with atomic_write(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")

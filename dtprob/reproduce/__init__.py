@@ -1,0 +1,12 @@
+"""The figures of the seed report and the evidence for what dtprob claims, each made by one command.
+
+A figure's module has `run(key, runs, progress) -> Figure` and `RUNS`, the number of runs by default.
+"""
+
+from collections.abc import Mapping
+from typing import Final
+
+FIGURES: Final[Mapping[str, str]] = {
+    "label_grid": "dtprob.reproduce.label_grid",
+}
+"""For each figure's name, the module that makes it."""

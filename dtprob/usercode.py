@@ -1,0 +1,84 @@
+"""Models and effects of the user's own, named "package.module:function"."""
+
+import importlib
+import importlib.util
+import sys
+from collections.abc import Generator
+from contextlib import contextmanager
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+from dtprob.errors import InputError, unknown_name
+
+
+def load_object(name: str, folder: Path) -> Any:
+    """What "package.module:name" names; this runs the module.
+
+    A module beside the CASE file comes before one that is installed.
+
+    Args:
+        name: module and attribute.
+        folder: where to look for the module first.
+
+    Raises:
+        InputError: a malformed name, no such module, a module that does not run, or no such attribute (the
+            nearest one is named).
+    """
+    module_name, _, attribute = name.partition(":")
+    parts = module_name.split(".")
+    if not attribute.isidentifier() or not all(part.isidentifier() for part in parts):
+        remedy = "Write the module and the function, for example 'my_model:model'"
+        raise InputError(name, "'package.module:function'", f"'{name}'", remedy)
+    module = _load_module(module_name, parts, folder)
+    if not hasattr(module, attribute):
+        public = [entry for entry in vars(module) if not entry.startswith("_")]
+        raise unknown_name(f"module {module_name}", attribute, public, "name")
+    return getattr(module, attribute)
+
+
+def _load_module(name: str, parts: list[str], folder: Path) -> ModuleType:
+    beside = folder.joinpath(*parts)
+    is_beside = beside.with_suffix(".py").is_file() or (beside / "__init__.py").is_file()
+    with _importable_from(folder):
+        if is_beside:
+            _forget(parts[0], folder)
+        elif _find(name) is None:
+            expected = f"a module beside the CASE file ({parts[-1]}.py) or one that is installed"
+            raise InputError(f"module {name}", expected, "none of that name", "Check the name and the folder")
+        try:
+            return importlib.import_module(name)
+        except Exception as error:
+            got = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            raise InputError(f"module {name}", "a module that runs", got, "Correct the module") from error
+
+
+def _find(name: str) -> object:
+    try:
+        return importlib.util.find_spec(name)
+    except (ImportError, ValueError):
+        return None
+
+
+def _forget(top: str, folder: Path) -> None:
+    """Drop a module of the same name that was loaded from another folder."""
+    loaded = sys.modules.get(top)
+    if loaded is not None and not _lies_in(loaded, folder):
+        for name in [entry for entry in sys.modules if entry == top or entry.startswith(f"{top}.")]:
+            del sys.modules[name]
+    importlib.invalidate_caches()
+
+
+def _lies_in(module: ModuleType, folder: Path) -> bool:
+    places = [getattr(module, "__file__", None) or "", *getattr(module, "__path__", [])]
+    return any(Path(place).is_relative_to(folder) for place in places if place)
+
+
+@contextmanager
+def _importable_from(folder: Path) -> Generator[None]:
+    """Let modules in ``folder`` be imported, for the time of one import."""
+    sys.path.insert(0, str(folder))
+    try:
+        yield
+    finally:
+        sys.path.remove(str(folder))

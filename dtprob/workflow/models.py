@@ -1,0 +1,49 @@
+"""The models that a CASE can name. One that takes `paths` needs a [scene]."""
+
+import importlib
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from dtprob.data import ChannelData
+from dtprob.models.declaration import Model
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A model of dtprob.
+
+    Attributes:
+        function: where it is, "module:function".
+        data: the kind of data it explains.
+        derived: arguments that are computed from the others, each by a function of them, "module:function".
+    """
+
+    function: str
+    data: type
+    derived: Mapping[str, str] = field(default_factory=dict)
+
+    def load(self) -> Model:
+        """The model itself."""
+        return _load(self.function)
+
+    def derive(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
+        """The arguments that are computed from the others."""
+        return {name: _load(function)(arguments) for name, function in self.derived.items()}
+
+
+def _load(function: str) -> Callable[..., Any]:
+    module, name = function.split(":")
+    return getattr(importlib.import_module(module), name)
+
+
+MODELS: Mapping[str, Entry] = {
+    "phase_error_channel": Entry("dtprob.models.channel:phase_error_channel", ChannelData),
+    "ray_traced_channel": Entry("dtprob.models.channel:ray_traced_channel", ChannelData),
+    "ultra_wideband_channel": Entry(
+        "dtprob.models.ultra_wideband:ultra_wideband_channel",
+        ChannelData,
+        {name: f"dtprob.models.ultra_wideband:{name}" for name in ("rough_delay", "link_power")},
+    ),
+}
+"""The models that a CASE can name."""

@@ -1,0 +1,238 @@
+"""From a CASE file to everything a fit or a diagnosis needs: model, data, effects, engine, key."""
+
+import dataclasses
+import hashlib
+import inspect
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.case import Case, EngineSection
+from dtprob.data import ChannelData, Data, Table, read, read_table
+from dtprob.data.location import located
+from dtprob.effects import Effect, catalogue, summaries
+from dtprob.errors import InputError, unknown_name
+from dtprob.inference.engine import AbstractEngine
+from dtprob.inference.fit import ENGINES
+from dtprob.models.declaration import Model, declare
+from dtprob.usercode import load_object
+from dtprob.workflow.models import MODELS
+from dtprob.workflow.scene import paths_of
+
+type Say = Callable[[str], None]
+
+
+@dataclass(frozen=True)
+class Prepared:
+    """A case ready to run.
+
+    Attributes:
+        case: where it comes from.
+        model: the generative model.
+        data: its arguments by name.
+        reference: the arguments that the twin was learned from, if the case names them.
+        effects: the candidate effects that the model and the data allow.
+        engine: the inference engine.
+        key: the typed JAX key of the case's seed.
+        cluster: the axis or column whose values belong together; None for the model's own.
+        data_sha256: hash of the data file.
+    """
+
+    case: Case
+    model: Model
+    data: Mapping[str, Any]
+    reference: Mapping[str, Any] | None
+    effects: tuple[Effect, ...]
+    engine: AbstractEngine
+    key: jax.Array
+    cluster: str | None
+    data_sha256: str
+
+    @property
+    def provenance(self) -> dict[str, Any]:
+        """What identifies the run besides the versions of packages."""
+        case = self.case
+        return {
+            "seed": case.seed.value,
+            "engine": case.engine.name,
+            "model": case.model.name,
+            "data_sha256": self.data_sha256,
+        }
+
+
+def prepare(
+    case: Case,
+    *,
+    need: Literal["fit", "diagnosis"],
+    allow_code: bool = True,
+    cache: Path | None = None,
+    say: Say = lambda _: None,
+) -> Prepared:
+    """Read the data, load or trace the scene, and bind model, effects and engine.
+
+    Args:
+        case: a checked CASE.
+        need: a fit needs neither effects nor reference data.
+        allow_code: whether functions of the user's own may run.
+        cache: a folder in which traced paths are kept for the next run.
+        say: receives one line for each step that takes time.
+
+    Raises:
+        InputError: whatever in the case or its files is not as it must be.
+    """
+    if case.user_code and not allow_code:
+        expected = "a model and effects of dtprob, since --no-code is given"
+        remedy = "Leave --no-code out if you trust this code"
+        raise InputError(f"{case.path.name}", expected, f"the code {', '.join(case.user_code)}", remedy)
+    case = dataclasses.replace(case, data=dataclasses.replace(case.data, file=located(case.data.file)))
+    engine = make_engine(case.engine, f"{case.path.name} [engine]")
+    model = _model(case)
+    say(f"reading {case.data.file.name}")
+    arguments = _arguments(case, model, case.data.file, cache, say)
+    reference, effects = None, ()
+    if need == "diagnosis":
+        if case.data.reference is not None:
+            say(f"reading {case.data.reference.name}")
+            reference = _arguments(case, model, case.data.reference, cache, say)
+        effects = _effects(case, model, arguments)
+    key, digest = jax.random.key(case.seed.value), sha256(case.data.file)
+    return Prepared(case, model, arguments, reference, effects, engine, key, case.data.cluster, digest)
+
+
+def make_engine(section: EngineSection, where: str) -> AbstractEngine:
+    """The engine of a CASE, with its settings.
+
+    Args:
+        section: name and settings.
+        where: what to call them in an error.
+
+    Raises:
+        InputError: an unknown engine or setting, or a setting of the wrong type.
+    """
+    if section.name not in ENGINES:
+        raise unknown_name(f"{where} name", section.name, ENGINES, "engine")
+    kind: Any = ENGINES[section.name]
+    settings = {field.name: field.default for field in dataclasses.fields(kind) if field.init}
+    for name, value in section.options.items():
+        if name not in settings:
+            raise unknown_name(f"{where} options", name, settings, "setting")
+        default = settings[name]
+        is_plain = isinstance(default, bool | int | float | str)
+        if is_plain and not (type(value) is type(default) or (type(default) is float and type(value) is int)):
+            expected = f"a value like {default!r}"
+            raise InputError(f"{where} options {name}", expected, repr(value), "Correct the value")
+    return kind(**section.options)
+
+
+def sha256(path: Path) -> str:
+    """Hash of a file, or of all files of a folder by name."""
+    digest = hashlib.sha256()
+    files = sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
+    for file in files:
+        if path.is_dir():
+            digest.update(str(file.relative_to(path)).encode())
+        digest.update(file.read_bytes())
+    return digest.hexdigest()
+
+
+def _model(case: Case) -> Model:
+    name = case.model.name
+    where = f"{case.path.name} [model] name"
+    if ":" not in name:
+        if name not in MODELS:
+            raise unknown_name(where, name, MODELS, "model")
+        return MODELS[name].load()
+    found = load_object(name, case.folder)
+    if not callable(found):
+        raise InputError(where, "a function", type(found).__name__, "Name a NumPyro model")
+    return found
+
+
+def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Say) -> dict[str, Any]:
+    """The model's arguments from one data file, the scene and the options."""
+    takes = inspect.signature(model).parameters
+    needs_paths = "paths" in takes
+    if case.model.name in MODELS:
+        data = _expected(read(file, case.data.options), MODELS[case.model.name].data, file, case)
+    elif needs_paths:
+        data = _expected(read(file, case.data.options), ChannelData, file, case)
+    else:
+        data = read_table(file)
+    columns = data.arrays()
+    arguments = {name: _as_jax(array) for name, array in columns.items() if name in takes}
+    if case.data.cluster is not None and case.data.cluster in columns:
+        arguments[case.data.cluster] = columns[case.data.cluster]
+    if needs_paths and isinstance(data, ChannelData):
+        arguments["paths"] = paths_of(case, data, cache, say)
+    if case.data.phase is not None:
+        if "phase" in takes:
+            arguments["phase"] = case.data.phase
+        elif case.data.phase != "coherent":
+            expected = f"coherent phases, which {case.model.name} assumes"
+            remedy = "Choose a model that takes a phase, such as ray_traced_channel"
+            raise InputError(f"{case.path.name} [data] phase", expected, case.data.phase, remedy)
+    if case.model.name in MODELS:
+        arguments |= {name: jnp.asarray(v) for name, v in MODELS[case.model.name].derive(arguments).items()}
+    return arguments | _options(case, takes, arguments)
+
+
+def _expected(data: Data, kind: type, file: Path, case: Case) -> Data:
+    if isinstance(data, kind):
+        return data
+    names = ", ".join(list(data.arrays())[:6])
+    got = f"{type(data).__name__} ({names})"
+    hint = " under their canonical names" if isinstance(data, Table) else ""
+    remedy = f"Give {case.model.name} its kind of data{hint}"
+    raise InputError(file.name, kind.__name__, got, remedy)
+
+
+def _as_jax(array: np.ndarray) -> Any:
+    return array if array.dtype.kind == "U" else jnp.asarray(array)
+
+
+def _options(case: Case, takes: Mapping[str, inspect.Parameter], taken: Iterable[str]) -> dict[str, Any]:
+    where = f"{case.path.name} [model.options]"
+    free = [name for name in takes if name not in set(taken)]
+    for name in case.model.options:
+        if name not in free:
+            raise unknown_name(where, name, free, "option")
+    return {name: _frozen(value) for name, value in case.model.options.items()}
+
+
+def _frozen(value: Any) -> Any:
+    """Lists as tuples, so that settings can be compared and hashed."""
+    return tuple(_frozen(entry) for entry in value) if isinstance(value, list) else value
+
+
+def _effects(case: Case, model: Model, arguments: Mapping[str, Any]) -> tuple[Effect, ...]:
+    sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
+    use = case.effects.use
+    chosen: list[str | Effect] = []
+    for name in (use,) if isinstance(use, str) else use:
+        chosen += _own_effects(name, case) if ":" in name else [name]
+    offered = catalogue(sites, arguments, use="all" if use == "all" else chosen)
+    left_out = case.effects.exclude
+    known = {*summaries(), *(effect.name for effect in offered)}
+    for name in left_out:
+        if name not in known:
+            raise unknown_name(f"{case.path.name} [effects] exclude", name, known, "effect")
+    return tuple(effect for effect in offered if not {effect.family, effect.name} & set(left_out))
+
+
+def _axis(case: Case, arguments: Mapping[str, Any]) -> str | None:
+    """The cluster when it is an axis of the model, not a column of the data."""
+    return None if case.data.cluster in arguments else case.data.cluster
+
+
+def _own_effects(name: str, case: Case) -> list[str | Effect]:
+    found = load_object(name, case.folder)
+    entries = [found] if isinstance(found, Effect) else found
+    if not isinstance(entries, list | tuple) or not all(isinstance(entry, Effect) for entry in entries):
+        where = f"{case.path.name} [effects] use"
+        raise InputError(where, "an Effect or a list of them", type(found).__name__, f"Correct {name}")
+    return list(entries)

@@ -1,0 +1,123 @@
+"""The paths of a case's links: from a file, from an earlier run, or traced."""
+
+import dataclasses
+import hashlib
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dtprob.case import Case, SceneSection
+from dtprob.data import ChannelData
+from dtprob.data.location import located
+from dtprob.errors import InputError
+from dtprob.raytracing import storage
+from dtprob.raytracing.paths import PathSet
+
+_WALL_THICKNESS = 0.12
+
+
+def paths_of(case: Case, data: ChannelData, cache: Path | None, say: Callable[[str], None]) -> PathSet:
+    """The path set of the data's links: read, taken from the cache, or traced.
+
+    Args:
+        case: the CASE, with its scene.
+        data: the positions of the links.
+        cache: a folder in which traced paths are kept.
+        say: receives one line before tracing.
+
+    Raises:
+        InputError: no scene, a scene or path set that cannot be used, or a path set of other positions.
+    """
+    scene = None if case.scene is None else _found(case.scene)
+    if scene is None:
+        remedy = "Add [scene] with file and frequency"
+        raise InputError(case.path.name, f"a section [scene] for {case.model.name}", "none", remedy)
+    if scene.file.lower().endswith(".nc"):
+        return _same_links(storage.load(scene.file), _placed(scene, data), case)
+    kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
+    if kept is not None and kept.is_file():
+        return storage.load(kept)
+    say(f"tracing {len(data.rx_position)} links through {Path(scene.file).name}")
+    paths = _trace(scene, _placed(scene, data))
+    if kept is not None:
+        storage.save(paths, kept)
+    return paths
+
+
+def _found(scene: SceneSection) -> SceneSection:
+    """The scene with its file looked for among the measured data sets too."""
+    file = Path(scene.file)
+    folder = file.parent if file.exists() else located(file.parent)
+    return dataclasses.replace(scene, file=str(folder / file.name)) if _is_plan(scene) else scene
+
+
+def _is_plan(scene: SceneSection) -> bool:
+    return scene.file.lower().endswith(".json")
+
+
+def _placed(scene: SceneSection, data: ChannelData) -> ChannelData:
+    """The data with the height that the case gives to both ends added to their positions."""
+    if scene.device_height is None:
+        return data
+    up = np.array([0.0, 0.0, scene.device_height])
+    return dataclasses.replace(data, rx_position=data.rx_position + up, tx_position=data.tx_position + up)
+
+
+def _load(scene: SceneSection, frequency: float) -> Any:
+    """The scene for the ray tracer, from its file or from a floor plan."""
+    if not _is_plan(scene):
+        from dtprob.raytracing.trace import load_scene  # noqa: PLC0415  (needs the ray tracer)
+
+        return load_scene(scene.file, frequency, merge_shapes=scene.merge_shapes)
+    from dtprob.raytracing.floorplan import Surface, floorplan_scene, read_floorplan  # noqa: PLC0415
+
+    if scene.ceiling_height is None:
+        remedy = "Add ceiling_height = ..., in m"
+        raise InputError("[scene] of a floor plan", "a key 'ceiling_height'", "none", remedy)
+    plan = read_floorplan(scene.file)
+    wall = Surface(scene.wall_material, scene.wall_thickness or _WALL_THICKNESS)
+    return floorplan_scene(plan.walls, scene.ceiling_height, frequency, wall=wall, furniture=plan.furniture)
+
+
+def _trace(scene: SceneSection, data: ChannelData) -> PathSet:
+    from dtprob.raytracing.trace import trace  # noqa: PLC0415  (needs the ray tracer)
+
+    frequency = float(scene.frequency or 0.0)
+    return trace(
+        _load(scene, frequency),
+        data.tx_position,
+        data.rx_position,
+        max_depth=scene.max_depth,
+        refraction=scene.refraction,
+        diffraction=scene.diffraction,
+        diffuse_reflection=scene.diffuse_reflection,
+        tx_pattern=scene.tx_pattern,
+        rx_pattern=scene.rx_pattern,
+        polarization=scene.polarization,
+        frequency=frequency,
+    )
+
+
+def _scene_hash(scene: SceneSection, data: ChannelData) -> str:
+    """What a traced path set depends on, in 16 characters."""
+    digest = hashlib.sha256(json.dumps(dataclasses.asdict(scene), sort_keys=True).encode())
+    file = Path(scene.file)
+    if file.suffix.lower() in {".xml", ".json"} and file.is_file():
+        digest.update(file.read_bytes())
+    for positions in (data.tx_position, data.rx_position):
+        digest.update(positions.tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _same_links(paths: PathSet, data: ChannelData, case: Case) -> PathSet:
+    for name in ("rx_position", "tx_position"):
+        traced, measured = np.asarray(getattr(paths, name)), getattr(data, name)
+        if traced.shape != measured.shape or not np.allclose(traced, measured, rtol=0.0, atol=1e-3):
+            where = f"{case.path.name} [scene] file: {name}"
+            expected = f"the {len(measured)} positions of the data, to 1 mm"
+            got = f"{len(traced)} positions" + ("" if traced.shape != measured.shape else " elsewhere")
+            raise InputError(where, expected, got, "Trace the scene again for these data")
+    return paths

@@ -1,0 +1,67 @@
+"""What summary.json says of a posterior: each parameter's centre and spread, and how far to trust them."""
+
+import json
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+
+from dtprob.inference import Posterior, summary
+
+LARGEST = 1000
+"""Sites with more entries than this are only named: their draws are in posterior.nc."""
+ENOUGH_DRAWS = 400.0
+LARGEST_R_HAT = 1.01
+
+
+def summarise(posterior: Posterior) -> dict[str, Any]:
+    """The content of summary.json.
+
+    Args:
+        posterior: from any engine.
+
+    Returns:
+        plain numbers and text: `parameters` (for each entry of each latent site the columns of
+        `dtprob.inference.summary`, intervals of 90%), `not_summarised` (sites with too many entries),
+        `warnings` (sentences; empty when all is well), `chains`, `draws`, `diverging`, `provenance`. What
+        does not exist, such as the r-hat of a single chain, is left out.
+    """
+    sizes = {name: int(np.prod(posterior.draws[name].shape[2:])) for name in posterior.latent}
+    small = [name for name, size in sizes.items() if size <= LARGEST]
+    table = summary(posterior, small).to_dict("index") if small else {}
+    rows = {str(label): _present(row) for label, row in table.items()}
+    diverging = int(np.sum(posterior.sample_stats.get("diverging", 0)))
+    return {
+        "parameters": rows,
+        "not_summarised": [name for name in sizes if name not in small],
+        "warnings": list(_warnings(rows, diverging, posterior)),
+        "chains": posterior.chains,
+        "draws": posterior.draws_per_chain,
+        "diverging": diverging,
+        "provenance": json.loads(json.dumps(posterior.provenance, sort_keys=True)),
+    }
+
+
+def _present(row: dict[Any, Any]) -> dict[str, Any]:
+    return {
+        str(name): value
+        for name, value in row.items()
+        if isinstance(value, str) or math.isfinite(float(value))
+    }
+
+
+def _warnings(rows: dict[str, dict[str, Any]], diverging: int, posterior: Posterior) -> Iterable[str]:
+    if diverging:
+        total = posterior.chains * posterior.draws_per_chain
+        yield f"{diverging} of {total} draws diverged: raise the target acceptance, or reparametrise."
+    mixed = [name for name, row in rows.items() if row.get("rhat", 1.0) > LARGEST_R_HAT]
+    if mixed:
+        yield f"The chains disagree on {_some(mixed)} (r-hat above {LARGEST_R_HAT}): run longer."
+    few = [name for name, row in rows.items() if row.get("ess", math.inf) < ENOUGH_DRAWS]
+    if few and posterior.chains > 1:
+        yield f"Fewer than {ENOUGH_DRAWS:.0f} effective draws of {_some(few)}: run longer."
+
+
+def _some(labels: list[str]) -> str:
+    return ", ".join(labels[:5]) + (f" and {len(labels) - 5} more" if len(labels) > 5 else "")

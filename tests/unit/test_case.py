@@ -1,0 +1,169 @@
+"""CASE files: what is right is read as written, what is wrong is named with the remedy."""
+
+import pickle
+from pathlib import Path
+
+import pytest
+
+from dtprob.case import load_case
+from dtprob.errors import InputError
+from dtprob.usercode import load_object
+
+FULL = """
+[model]
+name = "phase_error_channel"
+[model.options]
+materials = "shared"
+[data]
+file = "channels.npz"
+reference = "earlier.npz"
+phase = "per_packet"
+cluster = "link"
+[scene]
+file = "simple_street_canyon"
+frequency = 6.0e9
+max_depth = 2
+refraction = true
+merge_shapes = false
+[effects]
+use = ["timing_offset", "gain_offset"]
+exclude = ["gain_offset[tx_0]"]
+[engine]
+name = "nuts"
+[engine.options]
+draws = 100
+[seed]
+value = 7
+"""
+
+SHORT = '[model]\nname = "multi_access"\n[data]\nfile = "log.csv"\n'
+
+
+def written(folder: Path, text: str) -> Path:
+    path = folder / "case.toml"
+    path.write_text(text)
+    return path
+
+
+def test_everything_is_read(tmp_path):
+    case = load_case(written(tmp_path, FULL))
+    assert case.model.name == "phase_error_channel"
+    assert case.model.options == {"materials": "shared"}
+    assert case.data.file == tmp_path / "channels.npz"
+    assert case.data.reference == tmp_path / "earlier.npz"
+    assert (case.data.phase, case.data.cluster) == ("per_packet", "link")
+    assert case.scene is not None
+    assert (case.scene.file, case.scene.frequency, case.scene.max_depth) == ("simple_street_canyon", 6e9, 2)
+    assert (case.scene.refraction, case.scene.diffraction, case.scene.merge_shapes) == (True, False, False)
+    assert case.effects.use == ("timing_offset", "gain_offset")
+    assert case.effects.exclude == ("gain_offset[tx_0]",)
+    assert (case.engine.name, case.engine.options, case.seed.value) == ("nuts", {"draws": 100}, 7)
+    assert case.user_code == ()
+    assert pickle.loads(pickle.dumps(case)) == case
+
+
+def test_defaults(tmp_path):
+    case = load_case(written(tmp_path, SHORT))
+    assert case.scene is None
+    assert (case.effects.use, case.engine.name, case.seed.value) == ("all", "laplace", 0)
+    assert (case.data.reference, case.data.phase, case.data.cluster) == (None, None, None)
+
+
+def test_paths_of_scenes_are_relative_to_the_case(tmp_path):
+    for name in ("room.xml", "sub/paths.nc"):
+        case = load_case(written(tmp_path, f'{SHORT}[scene]\nfile = "{name}"\nfrequency = 6000000000\n'))
+        assert case.scene is not None
+        assert case.scene.file == str(tmp_path / name)
+        assert isinstance(case.scene.frequency, float)
+
+
+BAD = {
+    "section": (
+        "[modle]\n",
+        r"case\.toml: expected one of the sections .* got 'modle'\. Did you mean 'model'\?",
+    ),
+    "key": (
+        f'{SHORT}[engine]\nnme = "nuts"\n',
+        r"case\.toml \[engine\]: expected one of the keys .*'nme'\. Did you mean 'name'\?",
+    ),
+    "key far from all": (f"{SHORT}[seed]\nqqq = 1\n", r"got 'qqq'\. Use a valid key\."),
+    "no model": ('[data]\nfile = "a.npz"\n', r"expected a section \[model\], got none"),
+    "no data": ('[model]\nname = "a"\n', r"expected a section \[data\], got none"),
+    "no name": ('[model]\n[data]\nfile = "a"\n', r"\[model\]: expected a key 'name', got none"),
+    "text": (f"{SHORT}[engine]\nname = 3\n", r"case\.toml \[engine\] name: expected text, got 3"),
+    "whole": (f"{SHORT}[seed]\nvalue = 1.5\n", r"\[seed\] value: expected a whole number from 0, got 1\.5"),
+    "negative": (f"{SHORT}[seed]\nvalue = -1\n", "expected a whole number from 0, got -1"),
+    "truth": (f"{SHORT}[seed]\nvalue = true\n", "expected a whole number from 0, got True"),
+    "flag": (
+        f'{SHORT}[scene]\nfile = "a"\nrefraction = "no"\n',
+        r"refraction: expected true or false, got 'no'",
+    ),
+    "frequency": (
+        f'{SHORT}[scene]\nfile = "a"\nfrequency = 0\n',
+        "frequency: expected a positive number, got 0",
+    ),
+    "no frequency": (
+        f'{SHORT}[scene]\nfile = "munich"\n',
+        r"\[scene\]: expected a key 'frequency', got none",
+    ),
+    "phase": (
+        '[model]\nname = "a"\n[data]\nfile = "a"\nphase = "x"\n',
+        r"phase: expected one of coherent, per_packet, none, got 'x'",
+    ),
+    "use": (
+        f"{SHORT}[effects]\nuse = [1]\n",
+        r"use: expected 'all', a list of names, or 'module:name', got \[1\]",
+    ),
+    "exclude": (f'{SHORT}[effects]\nexclude = "a"\n', "exclude: expected a list of names, got 'a'"),
+    "section as value": (f'engine = "nuts"\n{SHORT}', r"expected a section \[engine\], got 'nuts'"),
+    "options": ('[model]\nname = "a"\noptions = 1\n', "options: expected a table of settings, got 1"),
+    "toml": ("[model\n", r"expected a TOML file, got .*line 1"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_mistakes_are_named(tmp_path, case):
+    text, message = BAD[case]
+    with pytest.raises(InputError, match=message) as caught:
+        load_case(written(tmp_path, text))
+    assert "\n" not in str(caught.value)
+
+
+def test_missing_file(tmp_path):
+    with pytest.raises(InputError, match=r"none\.toml: expected a CASE file \(TOML\), got no such file"):
+        load_case(tmp_path / "none.toml")
+
+
+def test_own_module_beside_the_case(tmp_path):
+    for folder, value in (("a", 1), ("b", 2)):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "own_parts.py").write_text(f"VALUE = {value}\n")
+        (tmp_path / folder / "own_model.py").write_text(
+            "import own_parts\ndef model(): return own_parts.VALUE\n"
+        )
+    assert load_object("own_model:model", tmp_path / "a")() == 1
+    assert load_object("own_parts:VALUE", tmp_path / "b") == 2
+    assert load_object("json:dumps", tmp_path / "a")([1]) == "[1]"
+
+
+def test_own_module_is_imported_without_a_trace_on_the_path(tmp_path):
+    import sys
+
+    before = list(sys.path)
+    (tmp_path / "own_other.py").write_text("model = print\n")
+    load_object("own_other:model", tmp_path)
+    assert sys.path == before
+
+
+def test_mistakes_in_own_modules_are_named(tmp_path):
+    (tmp_path / "own_broken.py").write_text("1 / 0\n")
+    (tmp_path / "own_named.py").write_text("def my_model(): ...\n")
+    for name, message in {
+        "own_absent:model": r"module own_absent: expected a module beside the CASE file \(own_absent\.py\)",
+        "own_broken:model": "expected a module that runs, got ZeroDivisionError: division by zero",
+        "own_named:mymodel": r"got 'mymodel'\. Did you mean 'my_model'\?",
+        "own_named:": "expected 'package.module:function'",
+        "../own_named:my_model": "expected 'package.module:function'",
+    }.items():
+        with pytest.raises(InputError, match=message):
+            load_object(name, tmp_path)

@@ -1,0 +1,130 @@
+"""From a CASE to model, data and effects: what binds to what, and what is refused."""
+
+import re
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dtprob.case import load_case
+from dtprob.data import ChannelData, write
+from dtprob.errors import InputError
+from dtprob.raytracing import storage
+from dtprob.workflow import prepare
+
+DEMO = Path(__file__).parents[3] / "dtprob" / "data" / "demo"
+
+
+@pytest.fixture
+def folder(tmp_path) -> Path:
+    """The first links of the recorded case."""
+    from dtprob.data import read
+
+    data = read(DEMO / "channels.npz")
+    assert isinstance(data, ChannelData)
+    arrays = data.arrays()
+    for name in ("channel", "rx_position", "tx_position"):
+        arrays[name] = arrays[name][:5]
+    write(tmp_path / "channels.npz", ChannelData(**arrays))
+    storage.save(storage.load(DEMO / "paths.nc").take(np.arange(5)), tmp_path / "paths.nc")
+    text = re.sub(r"^use = .*$", 'use = "all"', (DEMO / "case.toml").read_text(), flags=re.MULTILINE)
+    (tmp_path / "case.toml").write_text(text)
+    return tmp_path
+
+
+def change(folder: Path, old: str, new: str) -> Path:
+    path = folder / "case.toml"
+    text = path.read_text()
+    assert old in text
+    path.write_text(text.replace(old, new))
+    return path
+
+
+def test_arguments_of_a_ray_traced_model(folder):
+    prepared = prepare(load_case(folder / "case.toml"), need="fit")
+    assert prepared.model.__name__ == "ray_traced_channel"
+    assert prepared.data["channel"].shape[0] == prepared.data["paths"].n_link == 5
+    assert jnp.iscomplexobj(prepared.data["channel"])
+    assert prepared.data["phase"] == "coherent"
+    assert "rx_position" not in prepared.data
+    assert prepared.effects == ()
+    assert prepared.engine.name == "laplace"
+    assert len(prepared.data_sha256) == 64
+
+
+def test_effects_by_name_and_without_some(folder):
+    change(folder, 'use = "all"', 'use = ["timing_offset", "gain_offset"]\nexclude = ["gain_offset"]')
+    prepared = prepare(load_case(folder / "case.toml"), need="diagnosis")
+    assert {effect.family for effect in prepared.effects} == {"timing_offset"}
+
+
+def test_options_and_phase_reach_the_model(folder):
+    change(folder, "[data]", '[model.options]\nmaterials = "shared"\n[data]')
+    change(folder, 'phase = "coherent"', 'phase = "per_packet"')
+    data = prepare(load_case(folder / "case.toml"), need="fit").data
+    assert (data["materials"], data["phase"]) == ("shared", "per_packet")
+
+
+def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
+    from dtprob.workflow import scene
+
+    change(folder, 'file = "paths.nc"', 'file = "simple_street_canyon"')
+    traced = []
+
+    def fake_trace(section, data):
+        traced.append(section.file)
+        return storage.load(folder / "paths.nc")
+
+    monkeypatch.setattr(scene, "_trace", fake_trace)
+    case = load_case(folder / "case.toml")
+    first = prepare(case, need="fit", cache=folder / "out")
+    second = prepare(case, need="fit", cache=folder / "out")
+    assert traced == ["simple_street_canyon"]
+    np.testing.assert_array_equal(first.data["paths"].delay, second.data["paths"].delay)
+    change(folder, "merge_shapes = false", "merge_shapes = true")
+    prepare(load_case(folder / "case.toml"), need="fit", cache=folder / "out")
+    assert len(traced) == 2
+
+
+REFUSED = {
+    "other model's phase": (
+        ('name = "ray_traced_channel"', 'name = "phase_error_channel"'),
+        r"\[data\] phase: expected coherent phases, which phase_error_channel assumes, got per_packet",
+        ('phase = "coherent"', 'phase = "per_packet"'),
+    ),
+    "unknown effect": (('use = "all"', 'use = ["timing_ofset"]'), "Did you mean 'timing_offset'", None),
+    "data as option": (
+        ("[data]", "[model.options]\nchannel = 1\n[data]"),
+        "expected one of the options",
+        None,
+    ),
+    "paths are not there": (('file = "paths.nc"', 'file = "path.nc"'), "no such file", None),
+}
+
+
+@pytest.mark.parametrize("case", REFUSED)
+def test_refused(folder, case):
+    first, message, second = REFUSED[case]
+    change(folder, *first)
+    if second:
+        change(folder, *second)
+    with pytest.raises(InputError, match=message):
+        prepare(load_case(folder / "case.toml"), need="diagnosis")
+
+
+def test_paths_of_other_positions_are_refused(folder):
+    storage.save(storage.load(DEMO / "paths.nc").take(np.arange(5, 10)), folder / "paths.nc")
+    with pytest.raises(InputError, match="to 1 mm, got 5 positions elsewhere"):
+        prepare(load_case(folder / "case.toml"), need="fit")
+    storage.save(storage.load(DEMO / "paths.nc").take(np.arange(4)), folder / "paths.nc")
+    with pytest.raises(InputError, match="expected the 5 positions of the data, to 1 mm, got 4 positions"):
+        prepare(load_case(folder / "case.toml"), need="fit")
+
+
+def test_a_ray_traced_model_needs_a_scene(folder):
+    text = (folder / "case.toml").read_text()
+    start, end = text.index("[scene]"), text.index("[effects]")
+    (folder / "case.toml").write_text(text[:start] + text[end:])
+    with pytest.raises(InputError, match=r"expected a section \[scene\] for ray_traced_channel, got none"):
+        prepare(load_case(folder / "case.toml"), need="fit")
