@@ -23,10 +23,11 @@ COMMANDS = {
     "fit": "dtprob.commands.fit",
     "diagnose": "dtprob.commands.diagnose",
     "reproduce": "dtprob.commands.reproduce",
+    "withheld": "dtprob.commands.withheld",
     "list": "dtprob.commands.listing",
     "doctor": "dtprob.commands.doctor",
 }
-"""For each command, the module whose `run` does it; it gets the command's options by name."""
+"""For each command, the module whose `run`, or the function of the subcommand's name, does it."""
 
 
 class Parser(argparse.ArgumentParser):
@@ -77,6 +78,7 @@ def parser() -> Parser:
     figure.add_argument("--runs", type=int, metavar="N", help="runs, instead of the figure's own number")
     figure.add_argument("--seed", type=int, default=0, metavar="S", help="where randomness starts")
     figure.add_argument("--resume", action="store_true", help="continue an interrupted run in the same DIR")
+    _add_withheld(add("withheld", "how good diagnoses are: cases whose cause is kept apart, and their score"))
     listing = add("list", "what there is to choose from")
     listing.add_argument("what", choices=("models", "engines", "effects"))
     listing.add_argument("--json", action="store_true", help="as JSON")
@@ -98,6 +100,31 @@ def _add_case(added: argparse.ArgumentParser) -> None:
     added.add_argument("--resume", action="store_true", help="continue an interrupted run in the same DIR")
 
 
+def _add_withheld(added: argparse.ArgumentParser) -> None:
+    parts = added.add_subparsers(metavar="STEP", dest="step", required=True)
+    generate = parts.add_parser("generate", help="make cases/NNNN/ and, apart from them, key.json")
+    generate.add_argument("--track", required=True, metavar="TRACK", help="kind of twin: channel")
+    generate.add_argument("--count", type=int, required=True, metavar="N", help="number of cases")
+    generate.add_argument("--seed", type=int, default=0, metavar="S", help="where randomness starts")
+    _add_out(generate)
+    kinds = ("null", "listed", "unlisted", "pair")
+    generate.add_argument("--kinds", nargs="+", default=kinds, metavar="KIND", help="kinds of cases in turn")
+    sizes = (25.0, 100.0, 400.0)
+    generate.add_argument(
+        "--lambdas", nargs="+", type=float, default=sizes, metavar="L", help="information of each effect"
+    )
+    run = parts.add_parser("run", help="diagnose CASES/NAME/case.toml into OUT/NAME/report.json")
+    run.add_argument("cases", type=Path, metavar="CASES", help="folder of the cases")
+    run.add_argument("--out", type=Path, required=True, metavar="ANSWERS", help="folder of the answers")
+    run.add_argument("--workers", type=int, default=1, metavar="N", help="processes at work")
+    run.add_argument("--seed", type=int, metavar="S", help="seed, instead of the cases'")
+    run.add_argument("--no-code", action="store_true", help="refuse cases that run code of their own")
+    run.add_argument("--resume", action="store_true", help="keep the answers that are there")
+    score = parts.add_parser("score", help="compare answers with their key: score.json, score.html")
+    score.add_argument("answers", type=Path, metavar="ANSWERS", help="folder of the answers")
+    score.add_argument("--key", type=Path, required=True, metavar="FILE", help="the cases' key.json")
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command.
 
@@ -108,13 +135,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         the exit status: 0 done, 1 the job failed, 2 wrong input, 130 stopped by Ctrl-C.
     """
     options = vars(parser().parse_args(arguments))
-    command, debug = options.pop("command"), options.pop("debug")
+    command, step, debug = options.pop("command"), options.pop("step", "run"), options.pop("debug")
     signal.signal(signal.SIGTERM, _terminate)
     avoid_miscompilation()
     try:
         if "case" in options:  # before anything heavy, so that a mistake in it shows at once
             options["case"] = load_case(options["case"])
-        importlib.import_module(COMMANDS[command]).run(**options)
+        getattr(importlib.import_module(COMMANDS[command]), step)(**options)
     except KeyboardInterrupt:
         resume = " Continue with the same command and --resume." if "resume" in options else ""
         return _fail(INTERRUPTED, f"stopped.{resume}", debug=debug)

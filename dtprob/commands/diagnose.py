@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from xarray import DataTree
+
 from dtprob import __version__
 from dtprob.case import Case
 from dtprob.commands.run import Run, chosen, infer, prepare_case, session, write_text
@@ -28,37 +30,56 @@ def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code:
     """
     with session() as say:
         job = Run(out, resume, not no_code, say)
-        prepared = prepare_case(chosen(case, engine, seed), job, "diagnosis", RESULTS)
-        reference = None
-        if prepared.reference is not None:
-            say("learning the twin from the reference data")
-            reference = infer(prepared, prepared.reference, out / "reference.nc", job)
-        say(f"{len(prepared.effects)} candidate effects")
-        diagnosis = diagnose(
-            prepared.model,
-            prepared.data,
-            prepared.effects,
-            key=prepared.key,
-            engine=prepared.engine,
-            cluster=prepared.cluster,
-            reference=reference,
-            say=say,
-        )
-        report = diagnosis.to_report()
-        report["provenance"] = {**report.get("provenance", {}), "dtprob": __version__, **prepared.provenance}
-        title = f"{case.data.file.name} against {case.model.name}"
-        write_diagnosis(out, report, diagnosis.to_datatree(), title=title)
+        report, gap = _diagnose(chosen(case, engine, seed), job)
+        write_diagnosis(out, report, gap, title=f"{case.data.file.name} against {case.model.name}")
         say(f"{report['verdict']}: {report.get('summary', '')}".rstrip(": "))
         say(f"done: {out / 'report.html'}")
 
 
-def write_diagnosis(out: Path, report: Mapping[str, Any], gap: Any, *, title: str) -> None:
+def answer(case: Case, out: Path, *, seed: int | None, no_code: bool) -> None:
+    """Diagnose a case without a word, into report.json alone.
+
+    Args:
+        case: what to diagnose.
+        out: the folder of the answer.
+        seed: instead of the case's.
+        no_code: refuse a case that runs the user's own code.
+    """
+    job = Run(out, resume=False, allow_code=not no_code, say=lambda _: None)
+    report, _ = _diagnose(chosen(case, None, seed), job)
+    write_text(out / "report.json", to_json(report))
+
+
+def _diagnose(case: Case, job: Run) -> tuple[dict[str, Any], DataTree]:
+    """The content of report.json and of gap.nc."""
+    prepared = prepare_case(case, job, "diagnosis", RESULTS)
+    reference = None
+    if prepared.reference is not None:
+        job.say("learning the twin from the reference data")
+        reference = infer(prepared, prepared.reference, job.out / "reference.nc", job)
+    job.say(f"{len(prepared.effects)} candidate effects")
+    diagnosis = diagnose(
+        prepared.model,
+        prepared.data,
+        prepared.effects,
+        key=prepared.key,
+        engine=prepared.engine,
+        cluster=prepared.cluster,
+        reference=reference,
+        say=job.say,
+    )
+    report = diagnosis.to_report()
+    provenance = {**report.get("provenance", {}), "dtprob": __version__, **prepared.provenance}
+    return {**report, "provenance": provenance}, diagnosis.to_datatree()
+
+
+def write_diagnosis(out: Path, report: Mapping[str, Any], gap: DataTree, *, title: str) -> None:
     """Write gap.nc, report.html and, last, report.json.
 
     Args:
         out: the folder.
         report: the content of report.json.
-        gap: an ``xarray.DataTree``, the content of gap.nc.
+        gap: the content of gap.nc.
         title: what was diagnosed.
     """
     with atomic_write(out / "gap.nc") as temporary:

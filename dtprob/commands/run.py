@@ -43,13 +43,18 @@ def _cache_folder() -> Path:
     return Path(home) / "dtprob" / "compiled"
 
 
-@contextmanager
-def session() -> Generator[Say]:
-    """Double precision, progress, and warnings told as plain lines, for the time of one command."""
+def configure() -> None:
+    """Double precision, and compiled programs kept between commands."""
     jax.config.update("jax_enable_x64", True)
     if jax.config.jax_compilation_cache_dir is None:
         jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
         jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+@contextmanager
+def session() -> Generator[Say]:
+    """Double precision, progress, and warnings told as plain lines, for the time of one command."""
+    configure()
     with telling() as say, warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: say(f"note: {message}")
         yield say

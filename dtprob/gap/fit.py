@@ -15,6 +15,7 @@ import numpy as np
 from scipy import linalg
 
 from dtprob.effects.effect import Effect
+from dtprob.gap.plausible import mixing_gain
 from dtprob.gap.problem import Block, Problem
 
 _LOG_2PI = float(np.log(2 * np.pi))
@@ -321,8 +322,22 @@ def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, conve
     schur = positive(schur)
     evidence -= 0.5 * float(np.linalg.slogdet(schur)[1]) if len(schur) else 0.0
     covariance = np.linalg.inv(schur) if len(schur) else schur
+    evidence += sum(_mixed(problem, active, x, covariance, e) for e in active.effects if e.kind == "mean")
     names = tuple(e.name for e in active.effects)
     return Fit(x, names, active.spread, value, evidence, covariance, active.global_index, converged)
+
+
+def _mixed(problem: Problem, active: Active, x: np.ndarray, covariance: np.ndarray, effect: Effect) -> float:
+    """What mixing the scale of an effect's prior adds to the log evidence."""
+    blocks = [problem.layout[effect.site_name(p.name)] for p in effect.parameters]
+    index = np.concatenate([b.index[0] for b in blocks])
+    place = [int(np.flatnonzero(active.global_index == i)[0]) for i in index]
+    null = np.concatenate([np.full(b.size, p.null) for b, p in zip(blocks, effect.parameters, strict=True)])
+    scale = np.concatenate(
+        [(prior_scale(p.prior) * np.ones(p.shape)).reshape(-1) for p in effect.parameters]
+    )
+    sided = len(index) == 1 and effect.parameters[0].is_one_sided
+    return mixing_gain(covariance[np.ix_(place, place)], x[index] - null, scale, one_sided=sided)
 
 
 def marginal(problem: Problem, fitted: Fit, *, steps: int = 20) -> np.ndarray:

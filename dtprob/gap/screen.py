@@ -18,6 +18,7 @@ from scipy import special, stats
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.directions import Tangents, surroundings, tangents
+from dtprob.gap.plausible import log_bayes_factor
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
 
@@ -219,15 +220,19 @@ class _Scores:
 
     @property
     def log_bayes_factor(self) -> np.ndarray:
-        """Log BF = -1/2 log|I + T J| + 1/2 u' (J + T^-1)^-1 u of each effect, with prior covariance T."""
-        result = []
-        for k, group in enumerate(self.groups):
-            j, t = self.part(k), np.diag(self.scale(k) ** 2)
-            result.append(
-                -0.5 * np.linalg.slogdet(np.eye(len(group)) + np.sqrt(t) @ j @ np.sqrt(t))[1]
-                + 0.5 * self.u[group] @ self.step(k)
-            )
-        return np.array(result)
+        """Of each effect, the scale of its prior mixed; see `dtprob.gap.plausible`."""
+        return np.array(
+            [
+                log_bayes_factor(
+                    self.part(k), self.u[group], self.scale(k), one_sided=_is_one_sided(self.effects[k])
+                )
+                for k, group in enumerate(self.groups)
+            ]
+        )
+
+
+def _is_one_sided(effect: Effect) -> bool:
+    return effect.dimension == 1 and effect.parameters[0].is_one_sided
 
 
 def _mean_scores(
@@ -301,8 +306,7 @@ def _mean_tests(scores: _Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]
         t = u[:, group] @ root
         if len(group) == 1:
             z[:, k] = t[:, 0] * np.sign(root[0, 0])
-            sided = effect.parameters[0].is_one_sided
-            p[:, k] = stats.norm.sf(z[:, k]) if sided else 2 * stats.norm.sf(np.abs(z[:, k]))
+            p[:, k] = stats.norm.sf(z[:, k]) if _is_one_sided(effect) else 2 * stats.norm.sf(np.abs(z[:, k]))
         else:
             square, d = (t**2).sum(1), root.shape[1]
             log_p = _log_gamma_tail(square / 2, d / 2)

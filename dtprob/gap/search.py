@@ -85,7 +85,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         steps.append(Step(seen, problem, trials, accepted))
         if accepted is None:
             return steps
-        fitted = polish(problem, trials[accepted])
+        fitted = trials[accepted]
 
 
 def _promise(seen: View) -> float:
@@ -147,7 +147,16 @@ def _trials(
         trials[name] = refit(
             problem, start, effects[name], screening.step.get(name), settings, found.get(name), seen
         )
-    return problem, trials
+    return problem, _polished(problem, trials, settings)
+
+
+def _polished(problem: Problem, trials: dict[str, fitting.Fit], settings: Settings) -> dict[str, fitting.Fit]:
+    """The trials, the best few freed from local optima.
+
+    The fit without an effect may have bent nuisances far away to imitate it; the refit has to find the way back.
+    """
+    best = sorted(trials, key=lambda name: -trials[name].log_evidence)[: settings.polished]
+    return {name: polish(problem, one) if name in best else one for name, one in trials.items()}
 
 
 def _chosen(seen: View, scanned: np.ndarray, settings: Settings) -> list[str]:

@@ -1,0 +1,182 @@
+"""`dtprob withheld`: cases whose cause is kept apart, their diagnoses, and the score of these."""
+
+import importlib
+import json
+import multiprocessing
+import os
+import warnings
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from pathlib import Path
+from typing import Any, Final
+
+from dtprob.commands.progress import Say, telling
+from dtprob.errors import InputError, unknown_name
+from dtprob.files import atomic_write
+
+TRACKS: Final = {"channel": "dtprob.physical.cases"}
+"""For each track, the module whose `generate_cases` writes its cases and their key."""
+
+_SHARED: Final = 4
+"""Cases that one worker takes in a row: neighbours are often alike and share compiled programs."""
+_LIFE: Final = 8
+"""Portions after which a worker is replaced, so that memory does not grow."""
+
+
+def generate(
+    track: str, count: int, seed: int, out: Path, *, kinds: Sequence[str], lambdas: Sequence[float]
+) -> None:
+    """Write cases/NNNN/ and, apart from them, key.json and truth/; whole cases of an earlier run are kept.
+
+    Args:
+        track: which kind of twin.
+        count: number of cases.
+        seed: from which everything is drawn.
+        out: the folder.
+        kinds: kinds of cases in turn.
+        lambdas: information that an effect carries, drawn from these.
+
+    Raises:
+        InputError: an unknown track or kind, or a count, seed or lambda out of range.
+    """
+    if track not in TRACKS:
+        raise unknown_name("--track", track, TRACKS, "track")
+    if count < 1 or seed < 0:
+        got = f"count {count}, seed {seed}"
+        raise InputError("withheld generate", "a count from 1 and a seed from 0", got, "Correct them")
+    from dtprob.commands.run import session  # noqa: PLC0415  (heavy)
+
+    with session() as say:
+        module = importlib.import_module(TRACKS[track])
+        say(f"making {count} cases")
+
+        def progress(done: int, all_: int) -> None:
+            if done % 10 == 0 or done == all_:
+                say(f"{done} of {all_}")
+
+        file = module.generate_cases(out, count, seed, kinds, lambdas, resume=True, progress=progress)
+        say(f"done: {out / 'cases'}, and the key apart: {file}")
+
+
+def run(cases: Path, out: Path, *, workers: int, seed: int | None, no_code: bool, resume: bool) -> None:
+    """Diagnose every CASES/NAME/case.toml into OUT/NAME/report.json; nothing but the cases is read.
+
+    Args:
+        cases: folder of the cases.
+        out: folder of the answers.
+        workers: processes at work.
+        seed: instead of the cases' own.
+        no_code: refuse cases that run code of their own.
+        resume: keep the answers that are there.
+
+    Raises:
+        InputError: no cases, or a number of workers below 1.
+        RuntimeError: some cases could not be diagnosed; why lies in OUT/NAME/error.txt.
+    """
+    found = sorted(path.parent.name for path in cases.glob("*/case.toml"))
+    if not found or workers < 1:
+        got = f"{len(found)} cases, {workers} workers"
+        raise InputError(f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them")
+    todo = [name for name in found if not (resume and (out / name / "report.json").is_file())]
+    jobs = [(cases, out, names, seed, no_code) for names in _portions(todo)]
+    failed: list[str] = []
+    with telling() as say:
+        say(f"{len(todo)} of {len(found)} cases to diagnose")
+        for done, missed in enumerate(_answers(jobs, workers, say), start=1):
+            failed += missed
+            say(f"{min(done * _SHARED, len(todo))} of {len(todo)}")
+    if failed:
+        raise RuntimeError(f"{len(failed)} cases failed, see error.txt of {', '.join(failed[:5])}")
+
+
+def score(answers: Path, key: Path) -> None:
+    """Write ANSWERS/score.json and ANSWERS/score.html.
+
+    Args:
+        answers: folder of the answers.
+        key: the key.json of the cases.
+
+    Raises:
+        InputError: no key, or answers that do not belong to it.
+    """
+    from dtprob.gap.score import score as scored  # noqa: PLC0415  (heavy)
+    from dtprob.report.score_page import render_score  # noqa: PLC0415
+
+    content = _json(key)
+    names = [str(case.get("name")) for case in content.get("cases", [])]
+    reports = {name: _report(answers / name) for name in names if (answers / name).is_dir()}
+    result = scored(content, reports)
+    with atomic_write(answers / "score.json") as temporary:
+        temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    with atomic_write(answers / "score.html") as temporary:
+        temporary.write_text(render_score(result), encoding="utf-8")
+    for stratum in result["strata"]:
+        print(f"{stratum['kind']}, lambda {stratum['lambda']:g}: {stratum['cases']} cases")
+        for name, rate in stratum["rates"].items():
+            print(f"  {name}: {rate['count']}/{rate['of']} ({rate['low']:.3f} to {rate['high']:.3f})")
+    print(f"done: {answers / 'score.html'}")
+
+
+def _portions(names: Sequence[str]) -> list[list[str]]:
+    return [list(names[i : i + _SHARED]) for i in range(0, len(names), _SHARED)]
+
+
+def _answers(jobs: Sequence[tuple[Any, ...]], workers: int, say: Say) -> Iterator[list[str]]:
+    """The failed names of each portion, as the portions end."""
+    if not jobs:
+        return
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(min(workers, len(jobs)), context, max_tasks_per_child=_LIFE) as pool:
+        waiting = [pool.submit(_diagnose_all, *job) for job in jobs]
+        try:
+            for ended in as_completed(waiting):
+                yield ended.result()
+        except BaseException:
+            say("stopping")
+            for process in list(pool._processes.values()):  # noqa: SLF001  (no public way to end a worker at once)
+                process.terminate()
+            pool.shutdown(wait=False, cancel_futures=True)
+            raise
+
+
+def _diagnose_all(
+    cases: Path, out: Path, names: Sequence[str], seed: int | None, no_code: bool
+) -> list[str]:
+    """Diagnose some cases in this process; the names of those that could not be."""
+    from dtprob.xla import avoid_miscompilation  # noqa: PLC0415
+
+    avoid_miscompilation()
+    from dtprob.case import load_case  # noqa: PLC0415  (after the compiler is set right)
+    from dtprob.commands.diagnose import answer  # noqa: PLC0415
+    from dtprob.commands.run import configure  # noqa: PLC0415
+
+    configure()
+    warnings.simplefilter("ignore")  # a report says itself what there is to note
+    failed = []
+    for name in names:
+        folder = out / name
+        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            answer(load_case(cases / name / "case.toml"), folder, seed=seed, no_code=no_code)
+        except Exception as error:  # noqa: BLE001  (one bad case must not end the others)
+            failed.append(name)
+            with atomic_write(folder / "error.txt") as temporary:
+                temporary.write_text(f"{type(error).__name__}: {error}\n", encoding="utf-8")
+        else:
+            (folder / "error.txt").unlink(missing_ok=True)
+    return failed
+
+
+def _report(folder: Path) -> dict[str, Any] | None:
+    file = folder / "report.json"
+    return _json(file) if file.is_file() else None
+
+
+def _json(file: Path) -> dict[str, Any]:
+    try:
+        return json.loads(file.read_text(encoding="utf-8"))
+    except OSError as error:
+        reason = os.strerror(error.errno or 0)
+        raise InputError(f"{file}", "a JSON file", reason, "Correct the path") from None
+    except ValueError as error:
+        raise InputError(f"{file}", "a JSON file", str(error), "Correct the path") from None

@@ -1,0 +1,72 @@
+"""How much an effect explains, weighed against how many sizes it could have had.
+
+An effect's prior says which sizes are plausible at most; real ones may be far smaller. Its scale is therefore mixed,
+log-uniformly, so that the price of an effect depends on how well the data determine it and not on its units.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float
+from scipy import special
+
+SCALES: Final = np.geomspace(1e-4, 1.0, 25)
+"""Prior scales, as shares of the largest plausible one."""
+
+
+def log_bayes_factor(
+    information: Float[np.ndarray, "n n"],
+    score: Float[np.ndarray, " n"],
+    scale: Float[np.ndarray, " n"],
+    *,
+    one_sided: bool = False,
+) -> float:
+    """Log Bayes factor of a normal likelihood against the null, the scale of the prior mixed.
+
+    For prior covariance (s T)^2 it is -1/2 log|I + s^2 T J T| + 1/2 s^2 u' T (I + s^2 T J T)^-1 T u.
+
+    Args:
+        information: J, nuisance-adjusted.
+        score: u, likewise.
+        scale: T, the prior's standard deviations.
+        one_sided: of a single parameter that cannot be below its null.
+    """
+    return float(special.logsumexp(_terms(information, score, scale, SCALES, one_sided)) - np.log(len(SCALES)))
+
+
+def mixing_gain(
+    covariance: Float[np.ndarray, "n n"],
+    estimate: Float[np.ndarray, " n"],
+    scale: Float[np.ndarray, " n"],
+    *,
+    one_sided: bool = False,
+) -> float:
+    """What mixing the prior's scale adds to a log evidence that was computed at its largest.
+
+    Args:
+        covariance: of the parameters given the data, under the prior at its largest scale.
+        estimate: the posterior mode less the null.
+        scale: the prior's standard deviations.
+        one_sided: of a single parameter that cannot be below its null.
+    """
+    precision = np.linalg.inv(covariance / np.outer(scale, scale))
+    information = precision - np.eye(len(scale))
+    unit, score = np.ones(len(scale)), precision @ (estimate / scale)
+    terms = _terms(information, score, unit, np.array([*SCALES, 1.0]), one_sided)
+    return float(special.logsumexp(terms[:-1]) - np.log(len(SCALES)) - terms[-1])
+
+
+def _terms(
+    information: np.ndarray, score: np.ndarray, scale: np.ndarray, scales: np.ndarray, one_sided: bool
+) -> np.ndarray:
+    """The log Bayes factor at each of the prior's scales."""
+    j, vectors = np.linalg.eigh(information * np.outer(scale, scale))
+    j, u = np.maximum(j, 0.0), vectors.T @ (score * scale)
+    spread = 1 + scales[:, None] ** 2 * j
+    terms = 0.5 * (scales[:, None] ** 2 * u**2 / spread - np.log(spread)).sum(axis=1)
+    if one_sided and len(u) == 1:
+        above = (score * scale)[0] * scales / np.sqrt(spread[:, 0])
+        terms = terms + np.log(2.0) + special.log_ndtr(above)
+    return terms

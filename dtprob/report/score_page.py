@@ -1,0 +1,27 @@
+"""The page of a score: how often diagnoses of withheld cases were right."""
+
+from collections.abc import Mapping
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from dtprob.report.palette import DARK, LIGHT
+
+
+def render_score(score: Mapping[str, Any]) -> str:
+    """The page of a score, as self-contained HTML.
+
+    Args:
+        score: the content of score.json, from `dtprob.gap.score`.
+
+    Returns:
+        the text of an HTML file: no script, no request.
+    """
+    environment = Environment(
+        loader=PackageLoader("dtprob.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template("score.html.jinja").render(score=score, light=LIGHT, dark=DARK)
