@@ -24,20 +24,3 @@ def pytest_runtest_makereport(item: pytest.Item, call: pytest.CallInfo[None]):
             f"skipped on CI, where '{needs.name}' must be there: {call.excinfo and call.excinfo.value}"
         )
     return report
-
-
-KNOWN_DEFECTS = (
-    "test_every_effect.py::test_all_together_compile_and_compose",
-    "test_checks.py::test_broken_models[fails_for_some-expected",
-    "test_checks.py::test_good_effects[mean]",
-    "test_checks.py::test_good_effects[variance]",
-    "test_checks.py::test_broken_effects[changes6-finite]",
-)
-"""Tests that fail for a known reason that is not mended yet."""
-
-
-def pytest_collection_modifyitems(items: list[pytest.Item]):
-    """Expect the known defects, so that a new one stands out."""
-    for item in items:
-        if any(name in item.nodeid for name in KNOWN_DEFECTS):
-            item.add_marker(pytest.mark.xfail(reason="known defect", strict=False))

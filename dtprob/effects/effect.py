@@ -175,7 +175,8 @@ class Rewriting(Messenger):
 
     Args:
         fn: the model.
-        effects: applied in this order where several rewrite one site.
+        effects: applied in this order where several rewrite one site; those of a handler inside this one
+            come before. Whatever the order, an effect finds in its context the final values of earlier sites.
         parameters: for each effect's name, its parameters by name. A variance effect without an entry
             "field" draws it.
         data: the model's data, for the effects' context.
@@ -260,6 +261,10 @@ def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
     """The model extended by effects whose parameters are latent sites named `effect.parameter`.
 
     The extended model has the signature, axes and cluster of the base model, and is as much a model as it.
+
+    Effects apply in the order listed, and those of the model that is extended before those of the extension,
+    so nesting makes no difference: with_effects(with_effects(m, a), b) has the sites of with_effects(m, a + b)
+    with the same values and densities. The order matters where several effects rewrite one site.
     """
     effects, signature = tuple(effects), inspect.signature(model)
 

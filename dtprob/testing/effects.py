@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 from numpyro import handlers
 
 from dtprob.effects.effect import FIELD, Effect, Parameter, Rewriting
@@ -43,12 +44,14 @@ def check_effect(
         expect(getattr(effect, name), what, f"a text for {name!r}", "none", "Say it in a line")
     for parameter in effect.parameters:
         _check_parameter(f"{what}, parameter {parameter.name!r}", parameter, key)
-    plain = _run(model, data, key)
-    for site in effect.sites:
-        expect(site in plain, what, f"a site {site!r} of the model", "none", "Give it to models that have it")
-    _check_null(what, effect, model, data, key, plain)
-    _check_away(what, effect, model, data, key, plain)
-    _check_derivative(what, effect, model, data, key)
+    with numpyro.validation_enabled(False):  # values that are not finite are for the checks to find
+        plain = _run(model, data, key)
+        for site in effect.sites:
+            remedy = "Give it to models that have it"
+            expect(site in plain, what, f"a site {site!r} of the model", "none", remedy)
+        _check_null(what, effect, model, data, key, plain)
+        _check_away(what, effect, model, data, key, plain)
+        _check_derivative(what, effect, model, data, key, plain)
 
 
 def _run(model: Model, data: Mapping[str, Any], key: jax.Array) -> Trace:
@@ -119,24 +122,30 @@ def _check_away(  # noqa: PLR0917
         expect(finite, f"{what}, site {name!r}", "a finite density", "another", "Keep the rewrite finite")
 
 
-def _check_derivative(
-    what: str, effect: Effect, model: Model, data: Mapping[str, Any], key: jax.Array
+def _check_derivative(  # noqa: PLR0917
+    what: str, effect: Effect, model: Model, data: Mapping[str, Any], key: jax.Array, plain: Trace
 ) -> None:
     null = {name: jnp.asarray(value, dtype=float) for name, value in effect.null().items()}
+    fixed = _field(effect, data, plain)
+    sizes = {name: _size(plain[name]["value"]) for name in effect.rewrites}
     for index, parameter in enumerate(effect.parameters):
-        scale = _spread(parameter)
-        shape = null[parameter.name].shape
-        direction = scale * jnp.abs(jax.random.normal(jax.random.fold_in(key, index), shape))
+        name = parameter.name
+        random = jax.random.normal(jax.random.fold_in(key, index), null[name].shape)
+        direction = _spread(parameter) * jnp.abs(random)
 
-        def outputs(step: jax.Array, name: str = parameter.name, along: jax.Array = direction) -> jax.Array:
-            return _outputs(effect, {**null, name: null[name] + step * along}, model, data, key)
+        def outputs(step: jax.Array, name: str = name, along: jax.Array = direction) -> jax.Array:
+            moved = {**null, **fixed, name: null[name] + step * along}
+            return _outputs(_rewritten(effect, moved, model, data, key), effect, sizes)
 
-        _compare(f"{what}, parameter {parameter.name!r}", outputs, one_sided=parameter.is_one_sided)
+        _compare(f"{what}, parameter {name!r}", outputs, one_sided=parameter.is_one_sided)
 
 
 def _compare(what: str, outputs: Callable[[jax.Array], jax.Array], *, one_sided: bool) -> None:
     zero = jnp.zeros(())
     _, slope = jax.jvp(outputs, (zero,), (jnp.ones(()),))
+    finite = bool(jnp.all(jnp.isfinite(slope)))
+    remedy = "Keep the rewrite smooth at the null; see where a root, an absolute value or a comparison acts"
+    expect(finite, what, "a finite derivative at the null", "another", remedy)
     step = jnp.asarray(float(jnp.finfo(zero.dtype).eps) ** (1 / 3))
     if one_sided:
         numeric = (-3 * outputs(zero) + 4 * outputs(step) - outputs(2 * step)) / (2 * step)
@@ -145,10 +154,7 @@ def _compare(what: str, outputs: Callable[[jax.Array], jax.Array], *, one_sided:
     size = float(jnp.max(jnp.abs(numeric), initial=0.0)) + float(jnp.max(jnp.abs(slope), initial=0.0))
     rounding = 20 * float(jnp.finfo(zero.dtype).eps) * float(jnp.max(jnp.abs(outputs(zero)))) / float(step)
     worst = float(jnp.max(jnp.abs(numeric - slope), initial=0.0))
-    finite = bool(jnp.all(jnp.isfinite(slope)))
     got = f"a difference of {worst:.3g} in {size:.3g}"
-    remedy = "Keep the rewrite smooth at the null; see where a root, an absolute value or a comparison acts"
-    expect(finite, what, "a finite derivative at the null", "another", remedy)
     expect(worst <= 1e-3 * size + rounding, what, "the derivative of finite differences", got, remedy)
 
 
@@ -157,22 +163,26 @@ def _spread(parameter: Parameter) -> jax.Array:
     return jnp.std(jnp.asarray(draws), axis=0)
 
 
-def _outputs(
-    effect: Effect, parameters: Mapping[str, Any], model: Model, data: Mapping[str, Any], key: jax.Array
-) -> jax.Array:
-    """All that the effect rewrites, as one real vector, each site in units of its own size."""
-    if effect.kind == "variance" and FIELD not in parameters:
-        plain = _run(model, data, key)
-        value = plain[effect.sites[0]]["value"]
-        context = {**data, **{n: m["value"] for n, m in plain.items() if "value" in m}}
-        shape = effect.shape_of_field(value, context)
-        parameters = {**parameters, FIELD: jax.random.normal(jax.random.key(1), shape)}
-    trace = _rewritten(effect, parameters, model, data, key)
+def _field(effect: Effect, data: Mapping[str, Any], plain: Trace) -> dict[str, jax.Array]:
+    """A fixed field for a variance effect, nothing for others."""
+    if effect.kind == "mean":
+        return {}
+    context = {**data, **{name: message["value"] for name, message in plain.items() if "value" in message}}
+    shape = effect.shape_of_field(plain[effect.sites[0]]["value"], context)
+    return {FIELD: jax.random.normal(jax.random.key(1), shape)}
+
+
+def _size(value: Any) -> jax.Array:
+    """The largest modulus, one where all is zero."""
+    largest = jnp.max(jnp.abs(jnp.asarray(value)), initial=0.0)
+    return jnp.where(largest > 0, largest, 1.0)
+
+
+def _outputs(trace: Trace, effect: Effect, sizes: Mapping[str, jax.Array]) -> jax.Array:
+    """All that the effect rewrites, as one real vector, each site in units of its size at the null."""
     parts: list[jax.Array] = []
     for name in effect.rewrites:
-        value = jnp.asarray(trace[name]["value"]).ravel()
-        size = jax.lax.stop_gradient(jnp.max(jnp.abs(value), initial=0.0))
-        value = value / jnp.where(size > 0, size, 1.0)
+        value = jnp.asarray(trace[name]["value"]).ravel() / sizes[name]
         parts += [value.real, value.imag] if jnp.iscomplexobj(value) else [value]
     for name in effect.distributions:
         parts.append(jnp.ravel(trace[name]["fn"].log_prob(trace[name]["value"])))

@@ -8,6 +8,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 
 from dtprob.inference.build import build_target
 from dtprob.inference.target import Inputs, Target
@@ -37,10 +38,11 @@ def check_model(model: Model, data: Mapping[str, Any], *, key: jax.Array | None 
     declaration = declare(model, data)
     what = f"model {declaration.name}"
     _check_axes(what, declaration)
-    _check_prior_predictive(what, model, data, declaration, key)
-    _check_repeats(what, model, data, key)
-    target, inputs = build_target(model, data)
-    _check_density(what, target, inputs, key)
+    with numpyro.validation_enabled(False):  # values that are not finite are for the checks to find
+        _check_prior_predictive(what, model, data, declaration, key)
+        _check_repeats(what, model, data, key)
+        target, inputs = build_target(model, data)
+        _check_density(what, target, inputs, key)
 
 
 def _check_axes(what: str, declaration: Declaration) -> None:

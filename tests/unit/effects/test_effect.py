@@ -126,6 +126,41 @@ def test_effects_apply_in_order_and_see_what_came_before():
     assert np.allclose(value, 2 * DATA["x"] ** 2)
 
 
+DOUBLE = Effect(
+    "double",
+    {"mean": lambda value, p, _: value * (1 + p["on"])},
+    (Parameter("on", dist.Normal(0.0, 1.0)),),
+    distributions={"y": lambda fn, p, _: dist.Normal(fn.mean * (1 + p["on"]), jnp.sqrt(fn.variance))},
+)
+SHIFT = Effect(
+    "shift",
+    {},
+    (Parameter("by", dist.Normal(0.0, 1.0)),),
+    distributions={"y": lambda fn, p, _: dist.Normal(fn.mean + p["by"], jnp.sqrt(fn.variance))},
+)
+DRAWN = {"slope": 0.5, "bend.curvature": 0.3, "double.on": 1.0, "scatter.scale": 0.2, "shift.by": -0.4}
+
+
+def outcome(extended):
+    """Value of the mean, and of the observation's density, at fixed parameters and a fixed field."""
+    fixed = handlers.substitute(extended, data={**DRAWN, "scatter.field": jnp.arange(6.0)})
+    trace = handlers.trace(handlers.seed(fixed, 0)).get_trace(**DATA)
+    return trace["mean"]["value"], trace["y"]["fn"].log_prob(DATA["y"])
+
+
+@pytest.mark.parametrize("cuts", [(1,), (2,), (3,), (1, 2), (1, 2, 3)])
+@pytest.mark.parametrize("order", [(BEND, DOUBLE, SCATTER, SHIFT), (SHIFT, SCATTER, DOUBLE, BEND)])
+def test_nesting_makes_no_difference(order, cuts):
+    """An extension of an extension is the extension by both lists, one after the other."""
+    nested = line
+    for begin, end in zip((0, *cuts), (*cuts, len(order)), strict=True):
+        nested = with_effects(nested, order[begin:end])
+    at_once, other_order = with_effects(line, order), with_effects(line, order[::-1])
+    for one, same, other in zip(outcome(at_once), outcome(nested), outcome(other_order), strict=True):
+        assert np.array_equal(one, same)
+        assert not np.allclose(one, other)  # else the test could not fail
+
+
 @pytest.mark.parametrize(
     ("prior", "null", "expected"),
     [
