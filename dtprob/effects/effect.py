@@ -263,8 +263,9 @@ def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
     The extended model has the signature, axes and cluster of the base model, and is as much a model as it.
 
     Effects apply in the order listed, and those of the model that is extended before those of the extension,
-    so nesting makes no difference: with_effects(with_effects(m, a), b) has the sites of with_effects(m, a + b)
-    with the same values and densities. The order matters where several effects rewrite one site.
+    so nesting makes no difference: with_effects(with_effects(m, a), b) has the sites of
+    with_effects(m, a + b) with the same values and densities. The order matters where several effects
+    rewrite one site.
     """
     effects, signature = tuple(effects), inspect.signature(model)
 

@@ -19,7 +19,7 @@ from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Evaluation, Inputs, Target
 from dtprob.models.declaration import trace_model
 
-_BATCH_ENTRIES = 2_000_000
+_BLOCK, _BLOCK_ENTRIES = 32, 2_000_000
 _RECORDED = ("jax", "numpyro", "blackjax")
 
 
@@ -49,11 +49,8 @@ def assemble(
     chains, draws = positions.shape[:2]
     shapes = jax.eval_shape(target.compiled(Target.evaluate), positions[0, 0], inputs)
     kept, left_out = _kept_sites(target, shapes, options, chains * draws)
-    flat = jnp.asarray(positions).reshape(chains * draws, target.dimension)
-    push = target.compiled(_push, kept, _batch_size(shapes, chains * draws))
-    values, pointwise, lp = jax.tree.map(
-        lambda x: np.asarray(x).reshape(chains, draws, *x.shape[1:]), push(flat, inputs)
-    )
+    pushed = [_pushed(target, inputs, np.asarray(chain), kept, _block_size(shapes)) for chain in positions]
+    values, pointwise, lp = jax.tree.map(lambda *parts: np.stack(parts), *pushed)
     declaration = target.declaration
     sites = [name for name in declaration.sites if name in values]
     return Posterior(
@@ -142,15 +139,30 @@ def _kept_sites(
     return (tuple(values), tuple(pointwise)), left_out
 
 
-def _batch_size(shapes: Evaluation, draws: int) -> int:
-    """How many draws to evaluate at once: a divisor of `draws` that bounds the memory."""
+def _block_size(shapes: Evaluation) -> int:
+    """How many draws to evaluate at once, within bounds of memory; the same however many draws there are."""
     entries = sum(x.size for x in jax.tree.leaves((shapes.values, shapes.log_likelihood)))
-    limit = max(1, min(draws, _BATCH_ENTRIES // max(entries, 1)))
-    return max(size for size in range(1, limit + 1) if draws % size == 0)
+    return max(1, min(_BLOCK, _BLOCK_ENTRIES // max(entries, 1)))
+
+
+def _pushed(
+    target: Target, inputs: Inputs, positions: Float[np.ndarray, "draw dimension"], kept: _Kept, block: int
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Float[np.ndarray, " draw"]]:
+    """A chain's draws pushed through the model by one program of one shape.
+
+    Programs of other shapes round otherwise, and a draw shall not depend on how many there are.
+    """
+    push = target.compiled(_push, kept)
+    padded = np.concatenate([positions, np.repeat(positions[-1:], -len(positions) % block, axis=0)])
+    blocks = [
+        jax.tree.map(np.asarray, push(padded[begin : begin + block], inputs))
+        for begin in range(0, len(padded), block)
+    ]
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(positions)], *blocks)
 
 
 def _push(
-    target: Target, kept: _Kept, batch: int, positions: Float[Array, "draw dimension"], inputs: Inputs
+    target: Target, kept: _Kept, positions: Float[Array, "draw dimension"], inputs: Inputs
 ) -> tuple[dict[str, Array], dict[str, Array], Float[Array, " draw"]]:
     def one(u: Float[Array, " dimension"]) -> tuple[dict[str, Array], dict[str, Array], Array]:
         run = target.evaluate(u, inputs)
@@ -158,4 +170,4 @@ def _push(
         pointwise = {name: run.log_likelihood[name] for name in kept[1]}
         return values, pointwise, sum(run.terms, start=jnp.zeros(()))
 
-    return jax.lax.map(one, positions, batch_size=batch)
+    return jax.vmap(one)(positions)

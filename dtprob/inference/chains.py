@@ -86,7 +86,7 @@ def recentre(target: Target, walk: Walk, chains: Chain, keys: PRNGKeyArray, inpu
 def advance(  # noqa: PLR0917  (settings first, since they are bound before compilation)
     target: Target,
     walk: Walk,
-    chunk: int,
+    rows: int,
     chains: Chain,
     keys: PRNGKeyArray,
     begin: Int[Array, ""],
@@ -96,8 +96,8 @@ def advance(  # noqa: PLR0917  (settings first, since they are bound before comp
     """Steps `begin` to `end` of all chains.
 
     Returns:
-        the chains, and by name the positions and statistics of each step, (chain, chunk, ...); rows from
-        end - begin on are empty.
+        the chains, and by name the positions and statistics of each step, (chain, rows, ...), of which the
+        first end - begin are filled.
     """
 
     def one(chain: Chain, key: PRNGKeyArray) -> tuple[Chain, dict[str, Array]]:
@@ -105,8 +105,8 @@ def advance(  # noqa: PLR0917  (settings first, since they are bound before comp
             moved, row = _step(target, walk, carry[0], jax.random.fold_in(key, number), number, inputs)
             return moved, jax.tree.map(lambda block, x: block.at[number - begin].set(x), carry[1], row)
 
-        rows = jax.eval_shape(lambda: _step(target, walk, chain, key, begin, inputs)[1])
-        empty = jax.tree.map(lambda x: jnp.zeros((chunk, *x.shape), x.dtype), rows)
+        row = jax.eval_shape(lambda: _step(target, walk, chain, key, begin, inputs)[1])
+        empty = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
         return jax.lax.fori_loop(begin, end, body, (chain, empty))
 
     return walk.over_chains(one, chains, jax.vmap(jax.random.fold_in, (0, None))(keys, STEP))

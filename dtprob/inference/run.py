@@ -1,6 +1,7 @@
 """The one run loop of all Markov chain engines: chunks, progress, checkpoint, resume.
 
-Chains advance a chunk of steps per call of one compiled function, and each chunk's draws go to the host.
+Chains advance a bounded number of steps per call of one compiled function, the same for every length of
+chunk, number of draws and interruption, and the draws go to the host.
 The key of a step is folded from the run's key, the chain and the step's number, so a draw does not depend
 on where chunks end, on an interruption, or on how many chains and draws there are.
 """
@@ -32,6 +33,7 @@ from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model
 
 _EXPLORE_SHARE = 5
+_ROWS = 100  # steps per call of the compiled function, whatever the chunk
 
 
 @dataclass(frozen=True)
@@ -115,10 +117,9 @@ class _Loop:
                 if done == self.walk.explore > 0:
                     chains = self._compiled(recentre)(chains, keys, self.inputs)
                 end = self._chunk_end(done)
-                move = self._compiled(advance, self.options.chunk)
-                chains, block = move(chains, keys, done, end, self.inputs)
+                chains, blocks = self._advance(chains, keys, done, end)
                 if done >= self.walk.warmup:
-                    kept.append(jax.tree.map(lambda x, rows=end - done: np.asarray(x[:, :rows]), block))
+                    kept += blocks
                 done = end
                 self._save(identity, done, chains, kept)
                 progress.report(done, "draws" if done > self.walk.warmup else "warmup", _note(kept))
@@ -126,6 +127,18 @@ class _Loop:
 
     def _compiled(self, function: Callable[..., Any], *settings: Any) -> Callable[..., Any]:
         return self.target.compiled(function, self.walk, *settings)
+
+    def _advance(
+        self, chains: Chain, keys: PRNGKeyArray, begin: int, end: int
+    ) -> tuple[Chain, list[dict[str, np.ndarray]]]:
+        """The chains after steps `begin` to `end`, and these steps' rows, by one program for every chunk."""
+        move = self._compiled(advance, _ROWS)
+        blocks: list[dict[str, np.ndarray]] = []
+        for first in range(begin, end, _ROWS):
+            rows = min(_ROWS, end - first)
+            chains, block = move(chains, keys, first, first + rows, self.inputs)
+            blocks.append(jax.tree.map(lambda x, rows=rows: np.asarray(x[:, :rows]), block))
+        return chains, blocks
 
     def _chunk_end(self, done: int) -> int:
         """The end of the chunk that begins after `done` steps: no chunk crosses a phase."""
