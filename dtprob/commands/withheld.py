@@ -76,7 +76,9 @@ def run(cases: Path, out: Path, *, workers: int, seed: int | None, no_code: bool
     found = sorted(path.parent.name for path in cases.glob("*/case.toml"))
     if not found or workers < 1:
         got = f"{len(found)} cases, {workers} workers"
-        raise InputError(f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them")
+        raise InputError(
+            f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
+        )
     todo = [name for name in found if not (resume and (out / name / "report.json").is_file())]
     jobs = [(cases, out, names, seed, no_code) for names in _portions(todo)]
     failed: list[str] = []
@@ -139,9 +141,7 @@ def _answers(jobs: Sequence[tuple[Any, ...]], workers: int, say: Say) -> Iterato
             raise
 
 
-def _diagnose_all(
-    cases: Path, out: Path, names: Sequence[str], seed: int | None, no_code: bool
-) -> list[str]:
+def _diagnose_all(cases: Path, out: Path, names: Sequence[str], seed: int | None, no_code: bool) -> list[str]:
     """Diagnose some cases in this process; the names of those that could not be."""
     from dtprob.xla import avoid_miscompilation  # noqa: PLC0415
 

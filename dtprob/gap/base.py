@@ -96,7 +96,7 @@ def _other_peaks(problem: Problem, x: np.ndarray, scale: np.ndarray) -> list[np.
                     if other.size == block.size:
                         line[:, other.index[0][j]] += shift * scale[other.index[0][j]]
                 lines.append(line)
-            values = problem.profile(np.concatenate(lines)).reshape(len(lines), _GRID)
+            values = problem.compiled.profile(np.concatenate(lines)).reshape(len(lines), _GRID)
             found += _peaks(np.where(np.isfinite(values), values, -np.inf), np.stack(lines))
     return [point for _, point in sorted(found, key=lambda f: -f[0])[:_MOST]]
 
@@ -137,7 +137,7 @@ def _sweep_angles(problem: Problem, x: np.ndarray) -> np.ndarray:
                 for offset in offsets:
                     moved = x.copy()
                     moved[position] += offset
-                    likelihood, _, local = problem.evaluate(moved)
+                    likelihood, _, local = problem.compiled.evaluate(moved)
                     trials.append(np.asarray(likelihood) + np.asarray(local))
                 x[position] += offsets[np.argmax(np.stack(trials), axis=0)]
     return x

@@ -61,7 +61,7 @@ def cross_fit(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> 
             problem, fitted.x, fitted.effects, weights=(~held).astype(float), spread=spread, steps=15
         )
         log_likelihood[held] = fitting.marginal(problem, part)[held]
-        squares = [np.asarray(v) for v in problem.prediction_error(part.x)]
+        squares = [np.asarray(v) for v in problem.compiled.prediction_error(part.x)]
         error[held], signal[held] = squares[0][held], squares[1][held]
         for block in blocks:
             estimates[block.name].append(part.x[block.index[0]])

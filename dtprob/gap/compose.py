@@ -155,7 +155,7 @@ def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
     for step in noise:
         x = fitted.x.copy()
         x[fitted.global_index] += root @ step
-        for name, value in problem.sites(x).items():
+        for name, value in problem.compiled.sites(x).items():
             if name in names:
                 draws[name].append(np.asarray(value).reshape(-1))
     contraction = _contraction(evidence)
@@ -195,7 +195,7 @@ def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
         directions = np.zeros((block.size, problem.dimension))
         directions[np.arange(block.size), block.index[0]] = 1.0
         precision = np.einsum(
-            "ki,ki->k", np.asarray(problem.prior_curvature(fitted.x, directions)), directions
+            "ki,ki->k", np.asarray(problem.compiled.prior_curvature(fitted.x, directions)), directions
         )
         variance = np.array([fitted.covariance[position[int(i)], position[int(i)]] for i in block.index[0]])
         size = problem.declaration.sites[block.name].size
@@ -210,7 +210,7 @@ def _next_measurement(evidence: Evidence, causes: tuple[Cause, ...]) -> dict[str
         return None
     step = next(s for s in reversed(evidence.steps) if s.accepted is not None)
     first, second = (c[-1] for c in causes[0].alias_class[:2])
-    a, b = (np.asarray(step.problem.residual(step.trials[n].x)) for n in (first, second))
+    a, b = (np.asarray(step.problem.compiled.residual(step.trials[n].x)) for n in (first, second))
     located = evidence.problem.rows.by_cluster(evidence.problem.rows.located) == 1
     gain = 0.5 * np.where(located, (a - b) ** 2, 0.0).sum(1)
     best = int(np.argmax(gain))

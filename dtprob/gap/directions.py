@@ -90,7 +90,7 @@ class Tangents:
 
 def surroundings(problem: Problem, x: np.ndarray) -> Surroundings:
     """Evaluate the sites and observed distributions at x."""
-    return Surroundings(problem, x, problem.sites(x), problem.around(problem.parameters(x)))
+    return Surroundings(problem, x, problem.compiled.sites(x), problem.compiled.observations(x))
 
 
 def tangents(around: Surroundings, effects: Sequence[Effect], programs: Programs) -> Tangents:
@@ -119,7 +119,7 @@ def tangents(around: Surroundings, effects: Sequence[Effect], programs: Programs
         extra[effect.name] = own
     columns = jnp.zeros((*problem.rows.gather.shape, sum(sizes)))
     if touched:
-        columns = problem.site_shift(around.x, {n: deltas[n] for n in touched})
+        columns = problem.compiled.site_shift(around.x, {n: deltas[n] for n in touched})
     for group, rows in direct:
         columns = columns.at[..., group].add(rows)
     return Tangents(tuple(effects), groups, columns, extra)

@@ -134,8 +134,8 @@ def basis(problem: Problem, active: Active) -> np.ndarray:
 
 def _system(problem: Problem, active: Active, x: np.ndarray) -> _System:
     directions = basis(problem, active)
-    w = problem.columns(x, directions)
-    e = problem.residual(x)
+    w = problem.compiled.columns(x, directions)
+    e = problem.compiled.residual(x)
     g_index, l_index = active.global_index, active.local_index
     n = len(g_index)
     weight = jnp.asarray(active.weights)
@@ -144,8 +144,8 @@ def _system(problem: Problem, active: Active, x: np.ndarray) -> _System:
     curvature = np.asarray(jnp.einsum("c,cmi,cmj->ij", weight, w[..., :n], w[..., :n]))
     cross = np.asarray(jnp.einsum("cmi,cmj->cij", w[..., :n], w[..., n:]))
     local = np.asarray(jnp.einsum("cmi,cmj->cij", w[..., n:], w[..., n:]))
-    prior_gradient = np.asarray(problem.prior_gradient(x))
-    hessian = np.asarray(problem.prior_curvature(x, directions))
+    prior_gradient = np.asarray(problem.compiled.prior_gradient(x))
+    hessian = np.asarray(problem.compiled.prior_curvature(x, directions))
     _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
@@ -208,7 +208,7 @@ def _step(
 
 def _objective(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     """Log posterior as one global entry followed by one per cluster, without weights."""
-    likelihood, prior, local = (np.asarray(v) for v in problem.evaluate(x))
+    likelihood, prior, local = (np.asarray(v) for v in problem.compiled.evaluate(x))
     extra, _, _ = effect_prior(problem, active, x)
     return np.concatenate([[float(prior) + extra], likelihood + local])
 
@@ -333,9 +333,7 @@ def _mixed(problem: Problem, active: Active, x: np.ndarray, covariance: np.ndarr
     index = np.concatenate([b.index[0] for b in blocks])
     place = [int(np.flatnonzero(active.global_index == i)[0]) for i in index]
     null = np.concatenate([np.full(b.size, p.null) for b, p in zip(blocks, effect.parameters, strict=True)])
-    scale = np.concatenate(
-        [(prior_scale(p.prior) * np.ones(p.shape)).reshape(-1) for p in effect.parameters]
-    )
+    scale = np.concatenate([(prior_scale(p.prior) * np.ones(p.shape)).reshape(-1) for p in effect.parameters])
     sided = len(index) == 1 and effect.parameters[0].is_one_sided
     return mixing_gain(covariance[np.ix_(place, place)], x[index] - null, scale, one_sided=sided)
 

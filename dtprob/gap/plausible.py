@@ -33,7 +33,9 @@ def log_bayes_factor(
         scale: T, the prior's standard deviations.
         one_sided: of a single parameter that cannot be below its null.
     """
-    return float(special.logsumexp(_terms(information, score, scale, SCALES, one_sided)) - np.log(len(SCALES)))
+    return float(
+        special.logsumexp(_terms(information, score, scale, SCALES, one_sided)) - np.log(len(SCALES))
+    )
 
 
 def mixing_gain(

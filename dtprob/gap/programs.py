@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
 
 import equinox as eqx
 import jax
@@ -13,6 +13,9 @@ import numpy as np
 from dtprob.effects.effect import FIELD, Context, Effect
 from dtprob.gap.quick import quick_jit
 from dtprob.models.declaration import Data, split_static
+
+TRIALS: Final = 16
+"""Sizes of each effect that are tried in one run."""
 
 
 class Programs:
@@ -43,11 +46,10 @@ class Programs:
             values: Mapping[str, jax.Array], sizes: Mapping[str, jax.Array], arrays: Any
         ) -> dict[str, dict[str, jax.Array]]:
             context = Context(eqx.combine(arrays, static), values)
-            return {
-                e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in means if e.name in sizes
-            }
+            return {e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in means}
 
         self._tangents, self._energy, self._trials = tangents, energy, trials
+        self._nulls = {e.name: np.asarray(null_vector(e)) for e in means}
 
     def site_tangents(self, values: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
         """For each mean effect and rewritten site the derivative (*site, parameter) at the null."""
@@ -55,9 +57,29 @@ class Programs:
 
     def trial_shifts(
         self, values: Mapping[str, jax.Array], sizes: Mapping[str, np.ndarray]
-    ) -> dict[str, dict[str, jax.Array]]:
-        """For each named effect, its rewritten sites less their values (trial, *site) at flat parameters (trial, n)."""
-        return self._trials(dict(values), {n: jnp.asarray(v) for n, v in sizes.items()}, self._arrays)
+    ) -> Iterator[tuple[str, slice, dict[str, jax.Array]]]:
+        """For each named effect, its rewritten sites less their values at flat parameters (trial, n).
+
+        Yields:
+            name, which of its trials, and for each site the shifts (trial, *site); all effects in portions of one
+            size, so that nothing is compiled anew.
+        """
+        longest = max((len(v) for v in sizes.values()), default=0)
+        for start in range(0, longest, TRIALS):
+            portion = {n: v[start : start + TRIALS] for n, v in sizes.items() if len(v) > start}
+            shifts = self._trials(
+                dict(values), {n: self._filled(n, portion) for n in self._nulls}, self._arrays
+            )
+            for name, part in portion.items():
+                moved = {site: shift[: len(part)] for site, shift in shifts[name].items()}
+                yield name, slice(start, start + len(part)), moved
+
+    def _filled(self, name: str, portion: Mapping[str, np.ndarray]) -> np.ndarray:
+        """One portion of an effect's trials, the null where there are none."""
+        rows = np.repeat(self._nulls[name][None], TRIALS, axis=0)
+        if name in portion:
+            rows[: len(portion[name])] = portion[name]
+        return rows
 
     def field_energy(
         self, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array]

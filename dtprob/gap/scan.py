@@ -19,9 +19,9 @@ from dtprob.gap.fit import prior_scale
 from dtprob.gap.problem import Problem
 
 _REACH = 2.5
-_GRID = 161
+_COARSE, _FINE = 32, 160
+_WAVES = 3
 _SCANNED = 2
-_LARGEST = 20_000_000
 _SMALL, _LARGE = 0.02, 1.0
 _BENT = 0.4
 _DRAWS = 64
@@ -53,11 +53,14 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
     found: dict[str, Found] = {}
     for anchor in (x, centre(problem, x)):
         around = surroundings(problem, anchor)
-        here = float(problem.shifted_likelihood(anchor, {}, 1)[0])
+        here = float(problem.compiled.shifted_likelihood(anchor, {}, 1)[0])
         probed = _likelihoods(problem, around, small)
         bent = [e for e in means if _is_bent(probed[e.name] - here)]
-        lines = {e.name: _lines(e, np.linspace(-_REACH, _REACH, _count(around, e))) for e in bent}
-        for name, values in _likelihoods(problem, around, lines).items():
+        lines, likelihoods = _scanned(problem, around, bent, _COARSE)
+        waves = [e for e in bent if _is_wave(likelihoods[e.name])]
+        for part, values in zip(_scanned(problem, around, waves, _FINE), (lines, likelihoods), strict=True):
+            values.update(part)
+        for name, values in likelihoods.items():
             best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
             gain = float(values[best]) - here
             if name not in found or gain > found[name].gain:
@@ -82,15 +85,24 @@ def centre(problem: Problem, x: np.ndarray) -> np.ndarray:
             moved = result.copy()
             moved[position] = x[position]
             trials.append(moved)
-    values = problem.profile(np.stack([result, *trials]))
+    values = problem.compiled.profile(np.stack([result, *trials]))
     best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
     return result if best == 0 else trials[best - 1]
 
 
-def _count(around: Surroundings, effect: Effect) -> int:
-    """Trial sizes per parameter that memory allows."""
-    entries = sum(around.grown()[site].size for site in effect.rewrites)
-    return int(np.clip(_LARGEST // max(entries * _SCANNED, 1), 9, _GRID))
+def _scanned(
+    problem: Problem, around: Surroundings, effects: Sequence[Effect], count: int
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Flat parameters along each effect's plausible range, and the log likelihoods there."""
+    lines = {e.name: _lines(e, np.linspace(-_REACH, _REACH, count)) for e in effects}
+    return lines, _likelihoods(problem, around, lines)
+
+
+def _is_wave(values: np.ndarray) -> bool:
+    """Whether a coarse line has so many peaks that it may miss some."""
+    lines = values.reshape(-1, _COARSE)
+    inner = lines[:, 1:-1]
+    return bool(np.max(np.sum((inner > lines[:, :-2]) & (inner >= lines[:, 2:]), axis=1)) >= _WAVES)
 
 
 def _lines(effect: Effect, offsets: np.ndarray) -> np.ndarray:
@@ -111,8 +123,11 @@ def _lines(effect: Effect, offsets: np.ndarray) -> np.ndarray:
 def _likelihoods(
     problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    shifts = problem.programs.trial_shifts(around.grown(), sizes)
-    return {n: problem.shifted_likelihood(around.x, deltas, len(sizes[n])) for n, deltas in shifts.items()}
+    found = {name: np.full(len(rows), -np.inf) for name, rows in sizes.items()}
+    for name, part, shifts in problem.programs.trial_shifts(around.grown(), sizes):
+        count = part.stop - part.start
+        found[name][part] = problem.compiled.shifted_likelihood(around.x, shifts, count)
+    return found
 
 
 def _is_bent(change: np.ndarray) -> bool:

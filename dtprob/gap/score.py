@@ -159,7 +159,9 @@ def score(key: Mapping[str, Any], reports: Mapping[str, Report | None]) -> dict[
     truths = _truths(key)
     answers = [Answer(name, truth, reports[name]) for name, truth in truths.items() if name in reports]
     if not answers:
-        raise InputError("answers", "a report for cases of this key", "none", "Give the folder of the answers")
+        raise InputError(
+            "answers", "a report for cases of this key", "none", "Give the folder of the answers"
+        )
     strata: dict[tuple[str, float], list[Answer]] = {}
     for answer in answers:
         size = 0.0 if answer.truth["kind"] == "null" else float(answer.truth.get("lambda") or 0.0)

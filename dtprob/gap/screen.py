@@ -88,8 +88,8 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     active = fitting.activate(problem, fitted.effects)
     directions = fitting.basis(problem, active)
     n = len(active.global_index)
-    w = problem.columns(fitted.x, directions)
-    hessian = np.asarray(problem.prior_curvature(fitted.x, directions))
+    w = problem.compiled.columns(fitted.x, directions)
+    hessian = np.asarray(problem.compiled.prior_curvature(fitted.x, directions))
     _, _, effect_curvature = fitting.effect_prior(
         problem, fitting.Active(active.blocks, active.effects, active.weights, fitted.spread), fitted.x
     )
@@ -132,10 +132,10 @@ def replicate(
     problem: Problem, fitted: fitting.Fit, projection: Projection, key: jax.Array, settings: Settings
 ) -> Replicates:
     """Draw the bootstrap that the screening and the maps share."""
-    rows, values = problem.replicate(fitted.x, jax.random.split(key, settings.replicates))
-    observed = projection.rows(problem.residual(fitted.x)[None])[0]
+    rows, values = problem.compiled.replicate(fitted.x, jax.random.split(key, settings.replicates))
+    observed = projection.rows(problem.compiled.residual(fitted.x)[None])[0]
     projected = projection.rows(rows[: settings.site_replicates])
-    gradients = problem.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
+    gradients = problem.compiled.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
     return Replicates(observed, rows, values, gradients, projected)
 
 
@@ -241,9 +241,9 @@ def _mean_scores(
     adjusted, coefficients = projection.adjust(found.columns)
     information = np.array(jnp.einsum("cmi,cmj->ij", found.columns, adjusted))
     total = np.array(jnp.einsum("cmi,cmi->i", found.columns, found.columns))
-    u = np.array(jnp.einsum("cmk,cm->k", adjusted, problem.residual(fitted.x)))
+    u = np.array(jnp.einsum("cmk,cm->k", adjusted, problem.compiled.residual(fitted.x)))
     u_null = np.array(jnp.einsum("cmk,rcm->rk", adjusted, drawn.rows))
-    values = problem.observed_values()
+    values = problem.observed_values
     for effect, group in zip(found.effects, found.groups, strict=True):
         for extra in found.extra[effect.name]:
             own = extra.shift.T @ extra.shift

@@ -236,7 +236,7 @@ def _starts(
         line = np.repeat(x[None], len(offsets), axis=0)
         line[:, position] += offsets
         lines.append(line)
-    values = np.asarray(problem.profile(np.concatenate([one_step[None], *lines])))
+    values = np.asarray(problem.compiled.profile(np.concatenate([one_step[None], *lines])))
     best = [(float(values[0]), one_step)]
     low = 1
     for line in lines:

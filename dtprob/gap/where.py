@@ -70,7 +70,7 @@ class Location:
 
 def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> Location:
     """Test every site family and every block of coordinates at a fit."""
-    values = {n: np.asarray(v) for n, v in problem.sites(fitted.x).items() if n in drawn.gradients}
+    values = {n: np.asarray(v) for n, v in problem.compiled.sites(fitted.x).items() if n in drawn.gradients}
     scores = _scores(problem, drawn.gradients, values)
     names = list(scores)
     tests = [_family_test(scores[name][0], scores[name][1:]) for name in names]
@@ -151,7 +151,9 @@ def _best_per_site(
         shape = drawn.gradients[site].shape[1:]
         grown = np.broadcast_to(value, shape)
         steps = [_direction(problem, best, score, variance, grown) for score in scores[best][: 1 + _CHANCE]]
-        shifts = projection.rows(jnp.moveaxis(problem.site_shift(fitted.x, {site: np.stack(steps)}), -1, 0))
+        shifts = projection.rows(
+            jnp.moveaxis(problem.compiled.site_shift(fitted.x, {site: np.stack(steps)}), -1, 0)
+        )
         rows = jnp.concatenate([drawn.observed[None], drawn.projected[:_CHANCE]])
         slope = np.asarray(jnp.einsum("ncm,ncm->n", shifts, rows))
         curvature = np.asarray(jnp.einsum("ncm,ncm->n", shifts, shifts))

@@ -102,7 +102,7 @@ def test_a_variance_effect_follows_its_quadratic_form(problem):
     form = left @ member @ member.T @ left
     mean, variance = np.trace(form), 2 * np.trace(form @ form)
     energy = problem.programs.field_energy(
-        {n: np.asarray(v) for n, v in problem.sites(fitted.x).items()}, drawn.gradients
+        {n: np.asarray(v) for n, v in problem.compiled.sites(fitted.x).items()}, drawn.gradients
     )["jitter"]
     null = energy[1:]
     assert abs(null.mean() - mean) < 5 * np.sqrt(variance / len(null))

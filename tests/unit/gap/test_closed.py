@@ -108,7 +108,7 @@ def test_local_coordinates_follow_the_names_of_clusters(order):
     problem = Problem(levels, {"device": order, "y": jnp.asarray(y)}, [], "device")
     fitted = fitting.fit(problem, problem.null(), tolerance=1e-9)
     expected = y.sum(1) / SIGMA**2 / (5 / SIGMA**2 + 1)
-    found = problem.sites(fitted.x)["level"][:, 0]
+    found = problem.compiled.sites(fitted.x)["level"][:, 0]
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     covariance = SIGMA**2 * np.eye(5) + 1.0
     marginal = [stats.multivariate_normal(np.zeros(5), covariance).logpdf(row) for row in y]

@@ -27,7 +27,7 @@ def case(request):
 
 def test_density_is_the_models(case):
     name, problem, x = case
-    likelihood, prior, local = problem.evaluate(x)
+    likelihood, prior, local = problem.compiled.evaluate(x)
     values = {n: problem.layout.part(jnp.asarray(x), n) for n in problem.declaration.latent}
     if name == "tone":  # angles stay unwrapped
         constrained = {**values, "gain": jnp.exp(values["gain"])}
@@ -36,35 +36,35 @@ def test_density_is_the_models(case):
     else:
         expected = -potential_energy(problem.model, (), dict(problem.data), values)
     np.testing.assert_allclose(likelihood.sum() + prior + local.sum(), expected, rtol=1e-10)
-    np.testing.assert_allclose(problem.profile(x[None])[0], expected, rtol=1e-10)
+    np.testing.assert_allclose(problem.compiled.profile(x[None])[0], expected, rtol=1e-10)
 
 
 def test_columns_and_residuals_give_the_score_of_each_cluster(case):
     _, problem, x = case
-    score = jnp.einsum("cmk,cm->ck", problem.columns(x, np.eye(len(x))), problem.residual(x))
-    slope = jax.jacrev(lambda v: problem.evaluate(v)[0])(jnp.asarray(x))
+    score = jnp.einsum("cmk,cm->ck", problem.compiled.columns(x, np.eye(len(x))), problem.compiled.residual(x))
+    slope = jax.jacrev(lambda v: problem.compiled.evaluate(v)[0])(jnp.asarray(x))
     np.testing.assert_allclose(score, slope, rtol=1e-8, atol=1e-8 * float(jnp.abs(slope).max()))
 
 
 def test_columns_are_linear_in_the_basis(case):
     _, problem, x = case
     basis = np.random.default_rng(3).normal(size=(3, len(x)))
-    whole = np.asarray(problem.columns(x, np.eye(len(x))))
+    whole = np.asarray(problem.compiled.columns(x, np.eye(len(x))))
     np.testing.assert_allclose(
-        problem.columns(x, basis), whole @ basis.T, rtol=1e-8, atol=1e-9 * np.abs(whole).max()
+        problem.compiled.columns(x, basis), whole @ basis.T, rtol=1e-8, atol=1e-9 * np.abs(whole).max()
     )
 
 
 def test_site_gradient_is_the_slope_along_each_site(case):
     _, problem, x = case
-    gradient = problem.site_gradient(x, problem.residual(x)[None])
+    gradient = problem.compiled.site_gradient(x, problem.compiled.residual(x)[None])
     for site, shape in problem.float_sites.items():
         rng = np.random.default_rng(4)
         delta = rng.normal(size=shape.shape).astype(shape.dtype)
         if np.iscomplexobj(delta):
             delta = delta + 1j * rng.normal(size=shape.shape)
         h = 1e-5
-        up, down = problem.shifted_likelihood(x, {site: np.stack([h * delta, -h * delta])}, 2)
+        up, down = problem.compiled.shifted_likelihood(x, {site: np.stack([h * delta, -h * delta])}, 2)
         slope = float(np.sum(np.real(np.asarray(gradient[site][0]) * delta)))
         np.testing.assert_allclose(slope, (up - down) / (2 * h), rtol=1e-6, atol=1e-6)
 
@@ -73,10 +73,10 @@ def test_site_shift_is_the_transpose_of_site_gradient(case):
     _, problem, x = case
     rng = np.random.default_rng(5)
     rows = jnp.asarray(rng.normal(size=problem.rows.gather.shape))
-    gradient = problem.site_gradient(x, rows[None])
+    gradient = problem.compiled.site_gradient(x, rows[None])
     for site, shape in problem.float_sites.items():
         delta = rng.normal(size=(2, *shape.shape)).astype(shape.dtype)
-        shift = problem.site_shift(x, {site: delta})
+        shift = problem.compiled.site_shift(x, {site: delta})
         forward = np.einsum("cm,cmn->n", rows, shift)
         back = np.real(np.asarray(gradient[site][0])[None] * delta).reshape(2, -1).sum(1)
         np.testing.assert_allclose(forward, back, rtol=1e-8, atol=1e-8)
@@ -92,14 +92,14 @@ def test_tangents_without_compilation_equal_those_of_live_effects(case):
     point = live.translate(x, problem)
     for effect, group in zip(found.effects, found.groups, strict=True):
         index = np.concatenate([b.index[0] for b in live.blocks_of(effect.name)])
-        expected = live.columns(point, np.eye(live.dimension)[index])
+        expected = live.compiled.columns(point, np.eye(live.dimension)[index])
         np.testing.assert_allclose(found.columns[..., group], expected, rtol=1e-8, atol=1e-9)
 
 
 def test_field_energy_is_the_sum_of_squared_link_scores(case):
     name, problem, x = case
     rows = jnp.asarray(np.random.default_rng(6).normal(size=(3, *problem.rows.gather.shape)))
-    gradients = problem.site_gradient(x, rows)
+    gradients = problem.compiled.site_gradient(x, rows)
     energy = problem.programs.field_energy(surroundings(problem, x).grown(), gradients)["jitter"]
     scores = np.asarray(gradients["mean"]).reshape(3, len(draw(name)["x"]), -1).sum(-1)
     np.testing.assert_allclose(energy, (scores**2).sum(-1), rtol=1e-8, atol=1e-20)
@@ -107,7 +107,7 @@ def test_field_energy_is_the_sum_of_squared_link_scores(case):
 
 def test_replicates_are_drawn_at_the_point(case):
     _, problem, x = case
-    rows, values = problem.replicate(x, jax.random.split(jax.random.key(0), 300))
+    rows, values = problem.compiled.replicate(x, jax.random.split(jax.random.key(0), 300))
     size = np.asarray(rows).std()
     assert np.abs(np.asarray(rows).mean(0)).max() < 6 * size / np.sqrt(300) + 0.35
     assert abs(float(rows.mean())) < 6 * size / np.sqrt(rows.size)
@@ -118,15 +118,15 @@ def test_prior_slopes(case):
     _, problem, x = case
 
     def density(v):
-        _, prior, local = problem.evaluate(v)
+        _, prior, local = problem.compiled.evaluate(v)
         return prior + local.sum()
 
     gradient = jax.grad(density)(jnp.asarray(x))
     scale = float(jnp.abs(gradient).max())
-    np.testing.assert_allclose(problem.prior_gradient(x), gradient, rtol=1e-9, atol=1e-12 * scale)
+    np.testing.assert_allclose(problem.compiled.prior_gradient(x), gradient, rtol=1e-9, atol=1e-12 * scale)
     curvature = -jax.hessian(density)(jnp.asarray(x))
     np.testing.assert_allclose(
-        problem.prior_curvature(x, np.eye(len(x))),
+        problem.compiled.prior_curvature(x, np.eye(len(x))),
         curvature,
         rtol=1e-8,
         atol=1e-12 * float(jnp.abs(curvature).max()),
@@ -136,7 +136,7 @@ def test_prior_slopes(case):
 def test_prediction_error_counts_locations():
     problem = Problem(line, draw("line"), EFFECTS)
     x = problem.start({"a": 0.7, "b": -1.2})
-    error, signal = problem.prediction_error(x)
+    error, signal = problem.compiled.prediction_error(x)
     data = problem.data
     np.testing.assert_allclose(error, ((data["y"] - 0.7 + 1.2 * data["x"]) ** 2).sum(1), rtol=1e-12)
     np.testing.assert_allclose(signal, (data["y"] ** 2).sum(1), rtol=1e-12)
@@ -153,18 +153,18 @@ def test_a_reference_takes_the_place_of_the_prior():
             return {"a": a, "b": b}
 
     problem = Problem(line, draw("line"), EFFECTS, None, Draws())
-    precision = np.diag(problem.prior_curvature(problem.null(), np.eye(2)))
+    precision = np.diag(problem.compiled.prior_curvature(problem.null(), np.eye(2)))
     np.testing.assert_allclose(precision, spread**-2.0, rtol=0.2)
-    slope = problem.prior_gradient(problem.start({"a": mean[0], "b": mean[1]}))
+    slope = problem.compiled.prior_gradient(problem.start({"a": mean[0], "b": mean[1]}))
     assert np.all(np.abs(slope) < 0.2 / spread)
 
 
 def test_an_exact_reference_is_accepted():
     problem = Problem(line, draw("line"), EFFECTS, None, PointMass({"a": 0.7, "b": -1.2}))
     x = problem.start({"a": 0.7, "b": -1.2})
-    sd = np.diag(problem.prior_curvature(x, np.eye(2))) ** -0.5
+    sd = np.diag(problem.compiled.prior_curvature(x, np.eye(2))) ** -0.5
     assert np.all(sd < 1e-4)
-    assert np.all(np.abs(problem.prior_gradient(x)) * sd < 1e-3)
+    assert np.all(np.abs(problem.compiled.prior_gradient(x)) * sd < 1e-3)
 
 
 def test_a_reference_keeps_its_precision_in_seconds():
@@ -177,7 +177,7 @@ def test_a_reference_keeps_its_precision_in_seconds():
             return {"delay": draws[0, :n], "gain": draws[1, :n]}
 
     problem = Problem(seconds, draw("seconds"), EFFECTS, None, Draws())
-    found = np.diag(problem.prior_curvature(problem.null(), np.eye(2))) ** -0.5
+    found = np.diag(problem.compiled.prior_curvature(problem.null(), np.eye(2))) ** -0.5
     np.testing.assert_allclose(found, sd, rtol=0.1)
 
 
@@ -188,7 +188,7 @@ def test_translation_keeps_what_both_know():
     assert wide.dimension == 2 + 1 + 12
     np.testing.assert_array_equal(problem.translate(point, wide), [0.7, -1.2])
     np.testing.assert_allclose(
-        wide.evaluate(point)[0], problem.evaluate(np.array([0.7, -1.2]))[0], rtol=1e-12
+        wide.compiled.evaluate(point)[0], problem.compiled.evaluate(np.array([0.7, -1.2]))[0], rtol=1e-12
     )
     assert wide.with_live(["bend"]) is wide
 

@@ -1,0 +1,283 @@
+"""What a diagnosis asks of a model on data, each compiled when first asked."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from functools import cached_property
+from typing import Any, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.gap import whiten
+from dtprob.gap.quick import quick_jit
+from dtprob.gap.running import Runner
+
+_CHUNK = 16
+
+
+@final
+class Compiled:
+    """Compiled functions of a flat vector.
+
+    Args:
+        runner: the model.
+        arrays: its arguments that are arrays.
+        float_sites: deterministic sites that may be moved, in the largest shape that a candidate gives them.
+    """
+
+    def __init__(self, runner: Runner, arrays: Any, float_sites: Mapping[str, jax.ShapeDtypeStruct]) -> None:
+        self._runner, self._arrays, self._float_sites = runner, arrays, float_sites
+
+    @cached_property
+    def evaluate(self) -> Any:
+        """X -> (log likelihood per cluster, log prior of global nuisances, log prior of local ones per cluster)."""
+
+        @jax.jit
+        def evaluate(x: Any, arrays: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
+            trace, prior, local = self._runner.run(x, arrays, {})
+            rows = {}
+            for name, observed in self._runner.observations(trace).items():
+                density = whiten.log_prob(observed, trace[name]["value"])
+                rows[name] = jnp.zeros(self._runner.shapes[name]).at[0].set(density)
+            return self._runner.rows.stack(rows).sum(1), prior, local
+
+        return lambda x: evaluate(jnp.asarray(x), self._arrays)
+
+    @cached_property
+    def profile(self) -> Any:
+        """X (n, dimension) -> log posterior of the base nuisances (n,), one point after another."""
+
+        @jax.jit
+        def profile(xs: jax.Array, arrays: Any) -> jax.Array:
+            def one(x: jax.Array) -> jax.Array:
+                trace, prior, local = self._runner.run(x, arrays, {})
+                observed = self._runner.observations(trace).items()
+                density = [jnp.sum(whiten.log_prob(o, trace[n]["value"])) for n, o in observed]
+                return jnp.sum(jnp.stack(density)) + prior + jnp.sum(local)
+
+            return jax.lax.map(one, xs)
+
+        def chunked(xs: np.ndarray) -> np.ndarray:
+            padded = np.concatenate([xs, np.repeat(xs[-1:], -len(xs) % _CHUNK, axis=0)])
+            parts = [
+                profile(jnp.asarray(padded[i : i + _CHUNK]), self._arrays)
+                for i in range(0, len(padded), _CHUNK)
+            ]
+            return np.concatenate([np.asarray(p) for p in parts])[: len(xs)]
+
+        return chunked
+
+    @cached_property
+    def residual(self) -> Any:
+        """X -> whitened residuals (cluster, row)."""
+
+        @jax.jit
+        def residual(x: Any, arrays: Any) -> jax.Array:
+            trace, _, _ = self._runner.run(x, arrays, {})
+            observed = self._runner.observations(trace).items()
+            return self._runner.rows.stack({n: whiten.residual(o, trace[n]["value"]) for n, o in observed})
+
+        return lambda x: residual(jnp.asarray(x), self._arrays)
+
+    @cached_property
+    def columns(self) -> Any:
+        """(x, basis (k, dimension)) -> whitened tangents (cluster, row, k)."""
+
+        @jax.jit
+        def columns(x: Any, basis: jax.Array, arrays: Any) -> jax.Array:
+            def parameters(x: Any) -> dict[str, whiten.Parameters]:
+                trace, _, _ = self._runner.run(x, arrays, {})
+                return {name: o.parameters for name, o in self._runner.observations(trace).items()}
+
+            here, push = jax.linearize(parameters, x)
+            observations = self._runner.around(here)
+
+            def shifted(direction: jax.Array) -> jax.Array:
+                tangent = push(direction)
+                return self._runner.rows.stack(
+                    {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
+                )
+
+            return jnp.moveaxis(jax.lax.map(shifted, basis, batch_size=_CHUNK), 0, -1)
+
+        def chunked(x: np.ndarray, basis: np.ndarray) -> jax.Array:
+            if not len(basis):
+                return jnp.zeros((*self._runner.rows.gather.shape, 0))
+            padded = np.concatenate([basis, np.zeros((-len(basis) % _CHUNK, self._runner.layout.dimension))])
+            starts = range(0, len(padded), _CHUNK)
+            parts = [
+                columns(jnp.asarray(x), jnp.asarray(padded[i : i + _CHUNK]), self._arrays) for i in starts
+            ]
+            return jnp.concatenate(parts, axis=-1)[..., : len(basis)]
+
+        return chunked
+
+    @cached_property
+    def replicate(self) -> Any:
+        """(x, keys (n,)) -> (whitened residuals (n, cluster, row), observed values (n, ...) by site) drawn at x."""
+
+        @quick_jit
+        def replicate(x: Any, keys: jax.Array, arrays: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
+            trace, _, _ = self._runner.run(x, arrays, {})
+            observations = self._runner.observations(trace)
+
+            def one(key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+                split = zip(observations.items(), jax.random.split(key, len(observations)), strict=True)
+                values = {name: whiten.sample(o, k) for (name, o), k in split}
+                return self._runner.rows.stack(
+                    {n: whiten.residual(o, values[n]) for n, o in observations.items()}
+                ), values
+
+            return jax.lax.map(one, keys)
+
+        return lambda x, keys: replicate(jnp.asarray(x), keys, self._arrays)
+
+    @cached_property
+    def site_gradient(self) -> Any:
+        """(x, rows (n, cluster, row)) -> for each deterministic site, gradients (n, ...) of <rows, whitened shift>."""
+
+        @quick_jit
+        def site_gradient(x: Any, rows: jax.Array, arrays: Any) -> dict[str, jax.Array]:
+            zero = {name: jnp.zeros(s.shape, s.dtype) for name, s in self._float_sites.items()}
+
+            def parameters(deltas: Mapping[str, Any]) -> dict[str, whiten.Parameters]:
+                trace, _, _ = self._runner.run(x, arrays, deltas)
+                return {name: o.parameters for name, o in self._runner.observations(trace).items()}
+
+            here, push = jax.linearize(parameters, zero)
+            observations = self._runner.around(here)
+
+            def inner(deltas: Mapping[str, Any], row: jax.Array) -> jax.Array:
+                tangent = push(deltas)
+                shifts = {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
+                return jnp.sum(row * self._runner.rows.stack(shifts))
+
+            return jax.lax.map(lambda row: jax.grad(inner)(zero, row), rows)
+
+        return lambda x, rows: site_gradient(jnp.asarray(x), rows, self._arrays)
+
+    @cached_property
+    def site_shift(self) -> Any:
+        """(x, {site: perturbations (n, ...)}) -> whitened shifts (cluster, row, n) to first order."""
+
+        @quick_jit
+        def site_shift(x: Any, deltas: dict[str, jax.Array], arrays: Any) -> jax.Array:
+            zero = {name: jnp.zeros(s.shape, s.dtype) for name, s in self._float_sites.items()}
+
+            def parameters(moved: dict[str, jax.Array]) -> dict[str, whiten.Parameters]:
+                trace, _, _ = self._runner.run(x, arrays, moved)
+                return {name: o.parameters for name, o in self._runner.observations(trace).items()}
+
+            here, push = jax.linearize(parameters, zero)
+            observations = self._runner.around(here)
+
+            def shifted(delta: dict[str, jax.Array]) -> jax.Array:
+                tangent = push(delta)
+                return self._runner.rows.stack(
+                    {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
+                )
+
+            return jnp.moveaxis(jax.lax.map(shifted, deltas), 0, -1)
+
+        def chunked(x: np.ndarray, deltas: Mapping[str, np.ndarray]) -> jax.Array:
+            n = len(next(iter(deltas.values())))
+            parts = [site_shift(jnp.asarray(x), chunk, self._arrays) for chunk in self._padded(deltas, n)]
+            return jnp.concatenate(parts, axis=-1)[..., :n]
+
+        return chunked
+
+    @cached_property
+    def shifted_likelihood(self) -> Any:
+        """(x, {site: perturbations (n, *site)}, n) -> log likelihood (n,) of the perturbed model."""
+
+        @quick_jit
+        def shifted_likelihood(x: Any, deltas: dict[str, jax.Array], arrays: Any) -> jax.Array:
+            def one(delta: dict[str, jax.Array]) -> jax.Array:
+                trace, _, _ = self._runner.run(x, arrays, delta)
+                observed = self._runner.observations(trace).items()
+                return jnp.sum(
+                    jnp.stack([jnp.sum(whiten.log_prob(o, trace[n]["value"])) for n, o in observed])
+                )
+
+            return jax.lax.map(one, deltas)
+
+        def chunked(x: np.ndarray, deltas: Mapping[str, Any], n: int) -> np.ndarray:
+            parts = [
+                shifted_likelihood(jnp.asarray(x), chunk, self._arrays) for chunk in self._padded(deltas, n)
+            ]
+            return np.concatenate([np.asarray(part) for part in parts])[:n]
+
+        return chunked
+
+    def _padded(self, deltas: Mapping[str, Any], n: int) -> Iterator[dict[str, jax.Array]]:
+        """Perturbations of all sites in chunks of one size, zero where none is given."""
+        for start in range(0, n, _CHUNK):
+            chunk = {}
+            for name, s in self._float_sites.items():
+                part = np.zeros((_CHUNK, *s.shape), s.dtype)
+                if name in deltas:
+                    given = np.asarray(deltas[name])[start : start + _CHUNK]
+                    part[: len(given)] = given
+                chunk[name] = jnp.asarray(part)
+            yield chunk
+
+    @cached_property
+    def observations(self) -> Any:
+        """X -> the observed distributions by site."""
+
+        @quick_jit
+        def observations(x: Any, arrays: Any) -> dict[str, whiten.Parameters]:
+            trace, _, _ = self._runner.run(x, arrays, {})
+            return {n: o.parameters for n, o in self._runner.observations(trace).items()}
+
+        return lambda x: self._runner.around(observations(jnp.asarray(x), self._arrays))
+
+    @cached_property
+    def sites(self) -> Any:
+        """X -> values of the latent and deterministic sites, by name."""
+
+        @quick_jit
+        def sites(x: Any, arrays: Any) -> dict[str, jax.Array]:
+            trace, _, _ = self._runner.run(x, arrays, {})
+            return {
+                n: trace[n]["value"]
+                for n in [*self._runner.declaration.latent, *self._runner.declaration.deterministic]
+            }
+
+        return lambda x: sites(jnp.asarray(x), self._arrays)
+
+    @cached_property
+    def prior_curvature(self) -> Any:
+        """(x, basis (k, dimension)) -> minus Hessian of the log prior of the base latents times each basis vector."""
+
+        @quick_jit
+        def prior_curvature(x: Any, basis: jax.Array, arrays: Any) -> jax.Array:
+            slope = jax.grad(self._runner.log_prior)
+            return -jax.vmap(lambda b: jax.jvp(lambda y: slope(y, arrays), (x,), (b,))[1])(basis)
+
+        return lambda x, basis: prior_curvature(jnp.asarray(x), jnp.asarray(basis), self._arrays)
+
+    @cached_property
+    def prior_gradient(self) -> Any:
+        """X -> gradient of the log prior of the base latents."""
+        prior_gradient = quick_jit(jax.grad(self._runner.log_prior))
+        return lambda x: prior_gradient(jnp.asarray(x), self._arrays)
+
+    @cached_property
+    def prediction_error(self) -> Any:
+        """X -> squared error and squared signal of each cluster (cluster,), over observations with a location."""
+
+        @quick_jit
+        def prediction_error(x: Any, arrays: Any) -> tuple[jax.Array, jax.Array]:
+            trace, _, _ = self._runner.run(x, arrays, {})
+            error, signal = {}, {}
+            for name, o in self._runner.observations(trace).items():
+                value, zero = trace[name]["value"], jnp.zeros(self._runner.shapes[name])
+                located = "loc" in o.parameters
+                error[name] = zero.at[0].set(jnp.abs(value - o.parameters["loc"]) ** 2) if located else zero
+                signal[name] = zero.at[0].set(jnp.abs(value) ** 2) if located else zero
+            return self._runner.rows.stack(error).sum(1), self._runner.rows.stack(signal).sum(1)
+
+        return lambda x: prediction_error(jnp.asarray(x), self._arrays)

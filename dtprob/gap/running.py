@@ -1,0 +1,134 @@
+"""Running a model with live effects at a flat vector of coordinates, its sites moved if need be."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpyro import handlers
+from numpyro.primitives import Messenger
+
+from dtprob.effects.effect import FIELD, Effect, Rewriting
+from dtprob.gap import whiten
+from dtprob.gap.layout import Layout, fold, transform_of
+from dtprob.gap.rows import Rows
+from dtprob.models.declaration import Declaration, Model
+
+
+class _Shift(Messenger):
+    """Adds a perturbation to deterministic sites."""
+
+    def __init__(self, deltas: Mapping[str, Any]) -> None:
+        super().__init__(None)
+        self._deltas = deltas
+
+    def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if msg["type"] == "deterministic" and msg["name"] in self._deltas:
+            msg["value"] = msg["value"] + self._deltas[msg["name"]]
+
+
+@final
+@dataclass(frozen=True)
+class Runner:
+    """A model with live effects; what of its arguments is an array comes with every call.
+
+    Attributes:
+        model: the base model.
+        declaration: its sites.
+        static: its arguments that are no arrays.
+        live: effects whose parameters are coordinates.
+        layout: where each latent site and parameter lies in the flat vector.
+        rows: the whitened rows of the observations.
+        shapes: (component, *site shape) of each observed site's rows.
+        families: the distribution family of each observed site.
+        known: mean and precision, unconstrained, of nuisances that earlier data inform instead of the prior.
+    """
+
+    model: Model
+    declaration: Declaration
+    static: Any
+    live: tuple[Effect, ...]
+    layout: Layout
+    rows: Rows
+    shapes: Mapping[str, tuple[int, ...]]
+    families: Mapping[str, str]
+    known: Mapping[str, tuple[np.ndarray, np.ndarray]]
+
+    def run(
+        self, x: Any, arrays: Any, deltas: Mapping[str, Any]
+    ) -> tuple[dict[str, Any], jax.Array, jax.Array]:
+        """Trace at x with perturbed sites; also the log prior of the base latents, global and per cluster."""
+        data = eqx.combine(arrays, self.static)
+        latent = {name: self.layout.part(x, name) for name in self.declaration.latent}
+        jacobians: dict[str, Any] = {}
+
+        def constrain(site: dict[str, Any]) -> Any:
+            if site["type"] != "sample" or site["name"] not in latent:
+                return None
+            transform = transform_of(site["fn"])
+            u = latent[site["name"]]
+            value = transform(u)
+            jacobians[site["name"]] = transform.log_abs_det_jacobian(u, value)
+            return value
+
+        with (
+            handlers.trace() as trace,
+            _Shift(deltas),
+            Rewriting(None, self.live, self._parameters(x), data),
+            handlers.substitute(substitute_fn=constrain),
+            handlers.seed(rng_seed=jax.random.key(0)),
+        ):
+            self.model(**data)
+        total, local = self._reference_prior(x), jnp.zeros(self.rows.n_cluster)
+        for name in self.declaration.latent:
+            if name in self.known:
+                continue
+            fn = trace[name]["fn"]
+            density = fn.log_prob(trace[name]["value"]) + fold(jacobians[name], fn.batch_shape)
+            if self.layout[name].local:
+                axis = self.declaration.sites[name].axes.index(str(self.declaration.cluster))
+                local = local + jnp.moveaxis(density, axis, 0).reshape(self.rows.n_cluster, -1).sum(1)
+            else:
+                total = total + jnp.sum(density)
+        return trace, total, local
+
+    def _parameters(self, x: Any) -> dict[str, dict[str, Any]]:
+        parameters: dict[str, dict[str, Any]] = {}
+        for effect in self.live:
+            if effect.kind == "mean":
+                names = {p.name: effect.site_name(p.name) for p in effect.parameters}
+                parameters[effect.name] = {name: self.layout.part(x, site) for name, site in names.items()}
+            else:
+                unit = {p.name: jnp.ones(p.shape) for p in effect.parameters}
+                parameters[effect.name] = {**unit, FIELD: self.layout.part(x, effect.site_name(FIELD))}
+        return parameters
+
+    def _reference_prior(self, x: Any) -> jax.Array:
+        """Log density, up to a constant, of the nuisances that a reference informs."""
+        total = jnp.zeros(())
+        for name, (mean, precision) in self.known.items():
+            d = self.layout.part(x, name).reshape(-1) - mean
+            total = total - 0.5 * d @ (precision @ d)
+        return total
+
+    def observations(self, trace: Mapping[str, Any]) -> dict[str, whiten.Observation]:
+        """The elementwise distributions of the observed sites of a trace."""
+        return observations(self.declaration, trace)
+
+    def around(self, parameters: Mapping[str, whiten.Parameters]) -> dict[str, whiten.Observation]:
+        """The observed distributions with given parameters."""
+        return {n: whiten.Observation(f, dict(parameters[n])) for n, f in self.families.items()}
+
+    def log_prior(self, x: Any, arrays: Any) -> jax.Array:
+        _, prior, local = self.run(x, arrays, {})
+        return prior + jnp.sum(local)
+
+
+def observations(declaration: Declaration, trace: Mapping[str, Any]) -> dict[str, whiten.Observation]:
+    """The elementwise distributions of a model's observed sites in a trace."""
+    return {n: whiten.observation(trace[n]["fn"], trace[n]["value"], n) for n in declaration.observed}
