@@ -13,7 +13,6 @@ import numpy as np
 
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
-from dtprob.gap.settings import Settings
 
 
 @dataclass(frozen=True)
@@ -68,15 +67,25 @@ def cross_fit(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> 
     return HeldOut(log_likelihood, error, signal, {n: np.stack(v) for n, v in estimates.items()})
 
 
-def floor(problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: float) -> tuple[float, float]:
+def floor(
+    problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: float, n_folds: int
+) -> tuple[float, float]:
     """Bracket of the best achievable total log likelihood (nats): (pessimistic, optimistic).
 
     The pessimistic end is what the fitted causes reach on held-out clusters; the optimistic one adds what moving any one
-    site freely would still gain, and the optimism of judging on the data of the fit.
+    site freely would still gain, and what not knowing the causes' parameters costs: d / 2 nats, d parameters estimated
+    from the share (K - 1) / K of the clusters.
+
+    Args:
+        problem: in which the causes are live.
+        full: the fit with the causes to all clusters.
+        after: held-out results with the causes.
+        remaining_gain: nats that a site could still gain, 0 where nothing is significant.
+        n_folds: K.
     """
     reached = float(after.log_likelihood.sum())
-    fitted = float(fitting.marginal(problem, full).sum())
-    return reached, max(reached, fitted) + max(remaining_gain, 0.0)
+    size = sum(e.dimension if e.kind == "mean" else 1 for e in problem.effects if e.name in full.effects)
+    return reached, reached + 0.5 * size * n_folds / (n_folds - 1) + max(remaining_gain, 0.0)
 
 
 def closed_fraction(
@@ -85,7 +94,8 @@ def closed_fraction(
     """Closed fraction with its 90% interval.
 
     Args:
-        before, after: held-out results without and with the causes.
+        before: held-out results without the causes.
+        after: held-out results with them.
         bracket: pessimistic and optimistic floor, total log likelihood.
         key: for the bootstrap over clusters.
         draws: bootstrap draws.
@@ -109,18 +119,3 @@ def nmse_db(result: HeldOut) -> float | None:
     """Normalised mean squared error of the prediction on held-out clusters, dB."""
     total = float(result.signal.sum())
     return None if total <= 0 else float(10 * np.log10(max(float(result.error.sum()) / total, 1e-300)))
-
-
-def agrees_over_strata(result: HeldOut, fitted: fitting.Fit) -> bool:
-    """Whether each fold's estimate of the causes lies within what leaving a fold out can explain."""
-    position = {int(i): j for j, i in enumerate(fitted.global_index)}
-    del position
-    return all(
-        bool(np.all(np.abs(e - e.mean(0)) <= 0.5 * np.abs(e.mean(0)) + 3 * e.std(0)))
-        for e in result.estimates.values()
-    )
-
-
-def settings_folds(problem: Problem, settings: Settings) -> int:
-    """Number of folds that the clusters allow."""
-    return max(2, min(settings.folds, problem.n_cluster))

@@ -84,7 +84,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     )
     remains = last.location.site_p_value <= settings.level / 2
     left = max((s.gain for s in last.location.sites), default=0.0) if remains else 0.0
-    bracket = closed.floor(last.problem, last.fitted, held_after, left)
+    bracket = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     fraction = (
         closed.closed_fraction(held_before, held_after, bracket, keys[3]) if last.fitted.effects else None
     )
