@@ -22,6 +22,7 @@ def compose(
     evidence: Evidence,
     causes: tuple[Cause, ...],
     verdict: str,
+    *,
     settings: Settings,
     engine: AbstractEngine,
     key: jax.Array,
@@ -86,7 +87,7 @@ def _where(evidence: Evidence) -> dict[str, Any]:
     accepted = {e.name: e for e in evidence.problem.effects if e.name in evidence.accepted}
     own = {site for e in accepted.values() for site in e.sites}
     closed_share = evidence.fraction.mean if evidence.fraction is not None else 0.0
-    sites = [
+    sites: list[dict[str, Any]] = [
         {
             "site": s.site,
             "p_value": s.p_value,

@@ -12,6 +12,7 @@ import numpy as np
 from dtprob.effects.effect import Effect, Parameter, with_effects
 from dtprob.gap import fit as fitting
 from dtprob.gap.diagnosis import Size
+from dtprob.gap.plausible import nulls, scales
 from dtprob.gap.problem import Problem
 from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.laplace import Laplace
@@ -65,11 +66,11 @@ def _posterior(
 
 def _start_at(engine: AbstractEngine, initial: Mapping[str, Any]) -> AbstractEngine:
     """The engine, started at given values where it can be."""
-    settings = {f.name for f in fields(engine)}  # pyright: ignore
+    settings = {f.name for f in fields(engine)}  # pyright: ignore[reportArgumentType]
     changes: dict[str, Any] = {"initial": initial} if "initial" in settings else {}
     if "starts" in settings:
         changes["starts"] = 1
-    return replace(engine, **changes) if changes else engine  # pyright: ignore
+    return replace(engine, **changes) if changes else engine  # pyright: ignore[reportArgumentType]
 
 
 def _prefix(effect: Effect, effects: Sequence[Effect]) -> str:
@@ -108,10 +109,6 @@ def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) 
 
 def _plausible(effect: Effect, fitted: fitting.Fit, problem: Problem) -> bool:
     if effect.kind == "variance":
-        return fitted.spread[effect.name] <= 4 * float(fitting.prior_scale(effect.parameters[0].prior).max())
-    for parameter in effect.parameters:
-        block = problem.layout[effect.site_name(parameter.name)]
-        away = np.abs(fitted.x[block.index[0]] - parameter.null)
-        if np.any(away > 4 * (fitting.prior_scale(parameter.prior) * np.ones(parameter.shape)).reshape(-1)):
-            return False
-    return True
+        return fitted.spread[effect.name] <= 4 * float(scales(effect).max())
+    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    return bool(np.all(np.abs(fitted.x[index] - nulls(effect)) <= 4 * scales(effect)))

@@ -22,6 +22,8 @@ from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.declaration import Data, Model
 
+_DEFAULT = Settings()
+
 
 def diagnose(
     model: Model,
@@ -31,9 +33,9 @@ def diagnose(
     key: jax.Array,
     engine: AbstractEngine,
     cluster: str | None = None,
-    settings: Settings = Settings(),
+    settings: Settings = _DEFAULT,
     reference: Posterior | None = None,
-    say: Say = lambda text: None,
+    say: Say = lambda _: None,
 ) -> Diagnosis:
     """Find out why data differ from a model.
 
@@ -67,7 +69,7 @@ def diagnose(
     evidence = _gather(problem, key, settings, say)
     causes = _causes(evidence, jax.random.fold_in(key, 7), engine, settings, say)
     verdict = decide(evidence, causes, settings)
-    return compose(evidence, causes, verdict, settings, engine, key)
+    return compose(evidence, causes, verdict, settings=settings, engine=engine, key=key)
 
 
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:

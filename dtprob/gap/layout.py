@@ -62,6 +62,10 @@ class Layout:
             return jnp.zeros(block.shape)
         return jax.lax.dynamic_slice_in_dim(x, block.offset, size).reshape(block.shape)
 
+    def indices(self, names: Iterable[str]) -> np.ndarray:
+        """Positions of some blocks that are not local to clusters, one after another."""
+        return np.concatenate([self[name].index[0] for name in names])
+
     def put(self, x: np.ndarray, name: str, value: Any) -> None:
         """Write the value of one block into x."""
         flat = np.asarray(value).reshape(-1)

@@ -6,11 +6,15 @@ log-uniformly, so that the price of an effect depends on how well the data deter
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 from scipy import special
+
+from dtprob.effects.effect import Effect
 
 SCALES: Final = np.geomspace(1e-4, 1.0, 25)
 """Prior scales, as shares of the largest plausible one."""
@@ -72,3 +76,32 @@ def _terms(
         above = (score * scale)[0] * scales / np.sqrt(spread[:, 0])
         terms = terms + np.log(2.0) + special.log_ndtr(above)
     return terms
+
+
+def prior_scale(prior: object) -> np.ndarray:
+    """Standard deviation of an effect's prior, from its variance or its second moment."""
+    base = prior
+    while hasattr(base, "base_dist"):
+        base = base.base_dist  # pyright: ignore[reportAttributeAccessIssue]
+    scale = getattr(base, "scale", None)
+    return np.asarray(scale if scale is not None else np.sqrt(np.asarray(prior.variance)))  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def scales(effect: Effect) -> Float[np.ndarray, " n"]:
+    """Prior standard deviation of each of an effect's parameters, flat."""
+    return _flat(effect, [prior_scale(p.prior) for p in effect.parameters])
+
+
+def nulls(effect: Effect) -> Float[np.ndarray, " n"]:
+    """The null of each of an effect's parameters, flat."""
+    return _flat(effect, [p.null for p in effect.parameters])
+
+
+def sides(effect: Effect) -> Bool[np.ndarray, " n"]:
+    """Which of an effect's parameters cannot be below their null, flat."""
+    return _flat(effect, [p.is_one_sided for p in effect.parameters])
+
+
+def _flat(effect: Effect, values: Sequence[ArrayLike]) -> np.ndarray:
+    parts = [np.broadcast_to(v, p.shape).reshape(-1) for v, p in zip(values, effect.parameters, strict=True)]
+    return np.concatenate(parts)

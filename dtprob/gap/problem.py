@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.effects.effect import FIELD, Effect, Rewriting
+from dtprob.effects.effect import FIELD, Context, Effect, Rewriting
 from dtprob.errors import InputError
 from dtprob.gap import whiten
 from dtprob.gap.compiled import Compiled
@@ -62,13 +62,14 @@ class Problem:
         self._check_effects()
         self._column = column
         self._known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-        self._set_live(())
+        self.set_live(())
         if reference is not None:
             self._known = normal_of(self._reference_draws(reference))
-            self._set_live(())
+            self.set_live(())
 
-    def _set_live(self, live: tuple[Effect, ...]) -> None:
+    def set_live(self, live: tuple[Effect, ...]) -> None:
         """Index rows and coordinates for a set of live effects; nothing is compiled yet."""
+        self.__dict__.pop("compiled", None)
         self.live = live
         shapes, families = self._observed_shapes()
         located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
@@ -90,10 +91,9 @@ class Problem:
         """The same problem with other live effects; what does not depend on them is shared."""
         if set(names) <= {e.name for e in self.live}:
             return self
+        _ = self.programs, self.float_sites  # made once, then shared
         other = copy(self)
-        other.__dict__.pop("compiled", None)
-        other.__dict__.update(programs=self.programs, float_sites=self.float_sites)
-        other._set_live(tuple(e for e in self.effects if e.name in names))
+        other.set_live(tuple(e for e in self.effects if e.name in names))
         return other
 
     @cached_property
@@ -181,7 +181,7 @@ class Problem:
                 trace, _, _ = self._runner.run(jnp.zeros(self.dimension), arrays, grown)
                 values = {n: jnp.asarray(trace[n]["value"]) for n in self.declaration.deterministic}
                 grown = {n: jnp.zeros(v.shape, v.dtype) for n, v in values.items()}
-                context = {**data, **{n: m["value"] for n, m in trace.items()}}
+                context = Context(data, {n: m["value"] for n, m in trace.items()})
                 for effect in self.effects:
                     parameters = effect.null()
                     if effect.kind == "variance":

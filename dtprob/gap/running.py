@@ -125,6 +125,7 @@ class Runner:
         return {n: whiten.Observation(f, dict(parameters[n])) for n, f in self.families.items()}
 
     def log_prior(self, x: Any, arrays: Any) -> jax.Array:
+        """Log prior of the base latents."""
         _, prior, local = self.run(x, arrays, {})
         return prior + jnp.sum(local)
 

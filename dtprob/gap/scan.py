@@ -15,7 +15,7 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.directions import Surroundings, surroundings
-from dtprob.gap.fit import prior_scale
+from dtprob.gap.plausible import nulls, scales, sides
 from dtprob.gap.problem import Problem
 
 _REACH = 2.5
@@ -107,11 +107,7 @@ def _is_wave(values: np.ndarray) -> bool:
 
 def _lines(effect: Effect, offsets: np.ndarray) -> np.ndarray:
     """Flat parameters (trial, parameter): each of the first few moved by offsets, in prior standard deviations."""
-    null = np.concatenate([np.full(int(np.prod(p.shape, dtype=int)), p.null) for p in effect.parameters])
-    scale = np.concatenate([(prior_scale(p.prior) * np.ones(p.shape)).reshape(-1) for p in effect.parameters])
-    sided = np.concatenate(
-        [np.full(int(np.prod(p.shape, dtype=int)), p.is_one_sided) for p in effect.parameters]
-    )
+    null, scale, sided = nulls(effect), scales(effect), sides(effect)
     lines = []
     for j in range(min(len(null), _SCANNED)):
         line = np.repeat(null[None], len(offsets), axis=0)

@@ -194,7 +194,13 @@ def _stratum(kind: str, size: float, answers: Sequence[Answer]) -> dict[str, Any
     }
     verdicts = sorted({answer.verdict for answer in answers})
     counts = {verdict: sum(a.verdict == verdict for a in answers) for verdict in verdicts}
-    result = {"kind": kind, "lambda": size, "cases": len(answers), "verdicts": counts, "rates": rates}
+    result: dict[str, Any] = {
+        "kind": kind,
+        "lambda": size,
+        "cases": len(answers),
+        "verdicts": counts,
+        "rates": rates,
+    }
     if group == "listed":
         right = [a.first for a in answers if is_right(a) and a.first]
         closed = [cause["closed_fraction"]["mean"] for cause in right if cause["closed_fraction"]]

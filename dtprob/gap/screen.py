@@ -13,19 +13,26 @@ from dataclasses import dataclass
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special, stats
+from scipy import stats
 
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.directions import Tangents, surroundings, tangents
-from dtprob.gap.plausible import log_bayes_factor
+from dtprob.gap.plausible import log_bayes_factor, scales
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
+from dtprob.gap.tails import (
+    LOG_SMALLEST,
+    family_wise,
+    field_log_bayes_factor,
+    gamma_tail,
+    log_gamma_tail,
+    normal_quantile,
+)
 
 _ABSORBED = 0.98
 _SEEN = 25.0
 _NOTHING = 1e-9
-_LOG_SMALLEST = -660.0
 
 
 @dataclass(frozen=True)
@@ -198,11 +205,6 @@ class _Scores:
     total: np.ndarray
     coefficients: np.ndarray
 
-    def scale(self, k: int) -> np.ndarray:
-        """Prior standard deviation of each parameter of one effect, flat."""
-        parts = [fitting.prior_scale(p.prior) * np.ones(p.shape) for p in self.effects[k].parameters]
-        return np.concatenate([part.reshape(-1) for part in parts])
-
     def part(self, k: int) -> np.ndarray:
         """Information of one effect's own parameters."""
         return self.information[np.ix_(self.groups[k], self.groups[k])]
@@ -216,7 +218,9 @@ class _Scores:
 
     def step(self, k: int) -> np.ndarray:
         """One-step estimate of one effect's parameters."""
-        return np.linalg.solve(self.part(k) + np.diag(self.scale(k) ** -2.0), self.u[self.groups[k]])
+        return np.linalg.solve(
+            self.part(k) + np.diag(scales(self.effects[k]) ** -2.0), self.u[self.groups[k]]
+        )
 
     @property
     def log_bayes_factor(self) -> np.ndarray:
@@ -224,7 +228,10 @@ class _Scores:
         return np.array(
             [
                 log_bayes_factor(
-                    self.part(k), self.u[group], self.scale(k), one_sided=_is_one_sided(self.effects[k])
+                    self.part(k),
+                    self.u[group],
+                    scales(self.effects[k]),
+                    one_sided=_is_one_sided(self.effects[k]),
                 )
                 for k, group in enumerate(self.groups)
             ]
@@ -256,46 +263,6 @@ def _mean_scores(
     return _Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
 
 
-def family_wise(p: np.ndarray, replicate_p: np.ndarray) -> np.ndarray:
-    """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show."""
-    quantiles = np.quantile(np.maximum(replicate_p, 1e-300), [0.05, 0.1, 0.25, 0.5])
-    effective = np.log1p(-np.array([0.05, 0.1, 0.25, 0.5])) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
-    m = float(np.clip(np.max(effective), 1.0, 1e6))
-    return -np.expm1(m * np.log1p(-np.minimum(p, 1 - 1e-16)))
-
-
-def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Upper-tail p-value and normal quantile of a positive statistic with the given null mean and variance."""
-    nothing = mean <= 0
-    mean, variance = (
-        np.where(nothing, 1.0, mean),
-        np.where(nothing, 1.0, np.maximum(variance, 1e-12 * mean**2)),
-    )
-    observed = np.where(nothing, 1.0, observed)
-    log_p = np.where(nothing, 0.0, _log_gamma_tail(observed * mean / variance, mean**2 / variance))
-    return np.exp(np.maximum(log_p, _LOG_SMALLEST)), _quantile(log_p)
-
-
-def _log_gamma_tail(value: np.ndarray, shape: np.ndarray | float) -> np.ndarray:
-    """Log upper-tail probability of a unit gamma, by its asymptote where the probability underflows."""
-    log_p = stats.gamma.logsf(value, shape)
-    far = (shape - 1) * np.log(np.maximum(value, 1e-300)) - value - special.gammaln(shape)
-    return np.where(np.isfinite(log_p), log_p, far)
-
-
-def field_log_bayes_factor(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
-    """Rough log Bayes factor of a random field, from the energy of its scores: nu/2 (r - 1 - log r) - log(nu)/2."""
-    safe = np.maximum(mean, 1e-300)
-    nu, ratio = 2 * safe**2 / np.maximum(variance, 1e-12 * safe**2), np.maximum(observed / safe, 1.0)
-    return np.where(mean > 0, nu / 2 * (ratio - 1 - np.log(ratio)) - np.log(nu) / 2, -np.inf)
-
-
-def _quantile(log_p: np.ndarray) -> np.ndarray:
-    """Normal quantile of an upper-tail probability given by its logarithm."""
-    far = np.sqrt(np.maximum(-2 * log_p - np.log(np.maximum(-4 * np.pi * log_p, 1e-12)), 0.0))
-    return np.where(log_p > _LOG_SMALLEST, stats.norm.isf(np.exp(np.maximum(log_p, _LOG_SMALLEST))), far)
-
-
 def _mean_tests(scores: _Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """p-values and z of score vectors u (n, columns) for each effect, (n, effect)."""
     p, z = np.ones((len(u), len(scores.effects))), np.zeros((len(u), len(scores.effects)))
@@ -309,8 +276,8 @@ def _mean_tests(scores: _Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]
             p[:, k] = stats.norm.sf(z[:, k]) if _is_one_sided(effect) else 2 * stats.norm.sf(np.abs(z[:, k]))
         else:
             square, d = (t**2).sum(1), root.shape[1]
-            log_p = _log_gamma_tail(square / 2, d / 2)
-            p[:, k], z[:, k] = np.exp(np.maximum(log_p, _LOG_SMALLEST)), _quantile(log_p)
+            log_p = log_gamma_tail(square / 2, d / 2)
+            p[:, k], z[:, k] = np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
     return np.maximum(p, 1e-300), z
 
 
@@ -324,7 +291,7 @@ def _absorbed(problem: Problem, fitted: fitting.Fit, scores: _Scores, effect: Ef
         return "nothing observed depends on it"
     own = np.diag(scores.part(k))
     left = own / np.maximum(scores.total[group], 1e-300)
-    if left.max() > 1 - _ABSORBED or (own * scores.scale(k) ** 2).max() > _SEEN:
+    if left.max() > 1 - _ABSORBED or (own * scales(scores.effects[k]) ** 2).max() > _SEEN:
         return None
     blocks = [b for b in fitting.activate(problem, fitted.effects).blocks if not b.local]
     owners = np.concatenate([[i] * b.size for i, b in enumerate(blocks)]) if blocks else np.zeros(0, int)

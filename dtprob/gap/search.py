@@ -14,8 +14,8 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
-from dtprob.gap.base import polish
 from dtprob.gap.problem import Problem
+from dtprob.gap.refit import polished, refit, starting_points
 from dtprob.gap.scan import Found, scan
 from dtprob.gap.screen import Projection, Screening, project, replicate, screen
 from dtprob.gap.settings import Settings
@@ -80,8 +80,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         if steps and _promise(seen) < settings.minor * (fitted.log_evidence - base.log_evidence):
             return [*steps, Step(seen, problem, {}, None)]
         problem, trials = _trials(seen, settings, say, first=not steps)
-        kinds = {e.name: e.kind for e in problem.effects}
-        accepted = _accept(seen.fitted, base, trials, kinds, len(seen.screening.names), settings)
+        accepted = _accept(seen, base, trials, settings)
         steps.append(Step(seen, problem, trials, accepted))
         if accepted is None:
             return steps
@@ -103,27 +102,23 @@ def alarmed(seen: View, settings: Settings) -> bool:
 
 
 def _accept(
-    fitted: fitting.Fit,
-    base: fitting.Fit,
-    trials: dict[str, fitting.Fit],
-    kinds: Mapping[str, str],
-    n: int,
-    settings: Settings,
+    seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings
 ) -> str | None:
-    """The refit with the largest evidence, if it outweighs the choice among n candidates and is no minor matter.
+    """The refit with the largest evidence, if it outweighs the choice among all candidates and is no minor matter.
 
     A random field can imitate nearly anything, so an effect with parameters of its own is preferred when it reaches a good
     part of the evidence; what the field would add on top is left to the next step.
     """
     if not trials:
         return None
+    fitted, kinds = seen.fitted, {e.name: e.kind for e in seen.problem.effects}
     gain = {name: trial.log_evidence - fitted.log_evidence for name, trial in trials.items()}
     best = max(gain, key=lambda name: gain[name])
     plain = {name: value for name, value in gain.items() if kinds[name] == "mean"}
     if plain and max(plain.values()) >= settings.relevance * gain[best]:
         best = max(plain, key=lambda name: plain[name])
     so_far = fitted.log_evidence - base.log_evidence
-    needed = max(np.log(n) + 3.0, settings.minor * so_far)
+    needed = max(np.log(len(kinds)) + 3.0, settings.minor * so_far)
     return best if gain[best] > needed else None
 
 
@@ -144,19 +139,17 @@ def _trials(
     trials = {}
     for name in chosen:
         say(f"refitting with {name}")
-        trials[name] = refit(
-            problem, start, effects[name], screening.step.get(name), settings, found.get(name), seen
-        )
-    return problem, _polished(problem, trials, settings)
+        starts = starting_points(problem, start.x, effects[name], screening.step.get(name), settings)
+        if name in found:
+            starts.append(_scanned_start(problem, seen.problem, effects[name], found[name]))
+        trials[name] = refit(problem, start, effects[name], starts)
+    return problem, polished(problem, trials, settings.polished)
 
 
-def _polished(problem: Problem, trials: dict[str, fitting.Fit], settings: Settings) -> dict[str, fitting.Fit]:
-    """The trials, the best few freed from local optima.
-
-    The fit without an effect may have bent nuisances far away to imitate it; the refit has to find the way back.
-    """
-    best = sorted(trials, key=lambda name: -trials[name].log_evidence)[: settings.polished]
-    return {name: polish(problem, one) if name in best else one for name, one in trials.items()}
+def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:
+    x = problem.translate(found.x, scanned)
+    x[problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)] = found.parameters
+    return x
 
 
 def _chosen(seen: View, scanned: np.ndarray, settings: Settings) -> list[str]:
@@ -183,68 +176,3 @@ def _affordable(problem: Problem, name: str) -> bool:
         return True
     shape = problem.float_sites[effect.sites[0]].shape
     return int(np.prod(shape, dtype=int)) // problem.n_cluster <= _LARGEST_FIELD
-
-
-def refit(
-    problem: Problem,
-    fitted: fitting.Fit,
-    effect: Effect,
-    step: np.ndarray | None,
-    settings: Settings,
-    found: Found | None = None,
-    seen: View | None = None,
-) -> fitting.Fit:
-    """The best of several refits with one more effect: from its one-step estimate and from a grid over its prior."""
-    names = (*fitted.effects, effect.name)
-    if effect.kind == "variance":
-        return fitting.fit(problem, fitted.x, names)
-    index = np.concatenate([b.index[0] for b in problem.blocks_of(effect.name)])
-    starts = _starts(problem, fitted.x, effect, index, step, settings)
-    if found is not None and seen is not None:
-        scanned = problem.translate(found.x, seen.problem)
-        scanned[index] = found.parameters
-        starts.append(scanned)
-    fits = [fitting.fit(problem, x, names) for x in starts]
-    return max(fits, key=lambda f: f.log_evidence)
-
-
-def _starts(
-    problem: Problem,
-    x: np.ndarray,
-    effect: Effect,
-    index: np.ndarray,
-    step: np.ndarray | None,
-    settings: Settings,
-) -> list[np.ndarray]:
-    """The one-step estimate and the best local maxima of the log posterior along each parameter."""
-    scale = np.concatenate(
-        [(fitting.prior_scale(p.prior) * np.ones(p.shape)).reshape(-1) for p in effect.parameters]
-    )
-    sided = np.concatenate(
-        [np.full(int(np.prod(p.shape, dtype=int)), p.is_one_sided) for p in effect.parameters]
-    )
-    one_step = x.copy()
-    if step is not None:
-        moved = np.clip(step, -4 * scale, 4 * scale)
-        one_step[index] += np.where(sided, np.maximum(moved, 1e-3 * scale), moved)
-    lines = []
-    for j, position in enumerate(index[:12]):
-        half = np.linspace(-2.5, 2.5, 2 * settings.grid + 1)
-        fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
-        offsets = np.unique(np.concatenate([half, fine, -fine])) * scale[j]
-        offsets = offsets[offsets >= 0] if sided[j] else offsets
-        line = np.repeat(x[None], len(offsets), axis=0)
-        line[:, position] += offsets
-        lines.append(line)
-    values = np.asarray(problem.compiled.profile(np.concatenate([one_step[None], *lines])))
-    best = [(float(values[0]), one_step)]
-    low = 1
-    for line in lines:
-        v = values[low : low + len(line)]
-        low += len(line)
-        padded = np.concatenate([[-np.inf], np.where(np.isfinite(v), v, -np.inf), [-np.inf]])
-        peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
-        best += [(float(v[k]), line[k]) for k in peaks]
-    ordered = sorted(best[1:], key=lambda b: -b[0])[: settings.starts]
-    floor = values[0] if len(ordered) else -np.inf
-    return [one_step] + [start for value, start in ordered if value > floor - 5.0]

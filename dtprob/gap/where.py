@@ -1,7 +1,8 @@
 """Where the gap lies: over the model's sites and over the data's coordinates, each map with family-wise control.
 
 Site families are made from the model's own trace: each deterministic site, perturbed additively or in proportion,
-independently per entry, pooled along axes, smooth along an axis or along a column of the data. One gradient per bootstrap replicate serves all of them.
+independently per entry, pooled along axes, smooth along an axis or along a column of the data. One gradient per bootstrap
+replicate serves all of them.
 """
 
 from __future__ import annotations
@@ -17,7 +18,8 @@ import numpy as np
 from dtprob.gap.curves import curves
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
-from dtprob.gap.screen import Projection, Replicates, family_wise, gamma_tail
+from dtprob.gap.screen import Projection, Replicates
+from dtprob.gap.tails import family_wise, gamma_tail
 
 _CHANCE = 8
 """Replicates that tell what a site would gain by chance."""
@@ -78,8 +80,9 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
     adjusted = (
         family_wise(p, np.stack([null for _, null in tests], axis=1).min(axis=1)) if names else np.ones(0)
     )
+    by_name = dict(zip(names, adjusted, strict=True))
     findings = _best_per_site(
-        problem, fitted, projection, drawn, dict(zip(names, adjusted, strict=True)), scores, values
+        problem, fitted, projection, drawn, adjusted=by_name, scores=scores, values=values
     )
     blocks, maps = _coordinates(problem, np.asarray(drawn.observed), np.asarray(drawn.projected))
     return Location(findings, blocks, maps, float(adjusted.min(initial=1.0)))
@@ -93,7 +96,9 @@ def _scores(
     for site, gradient in gradients.items():
         g, axes = np.asarray(gradient), problem.declaration.sites[site].axes
         for kind, entry in (("additive", g), ("relative", g * values[site])):
-            parts = np.stack([entry.real, entry.imag], -1) if np.iscomplexobj(entry) else entry[..., None]
+            parts = (
+                np.stack([np.real(entry), np.imag(entry)], -1) if np.iscomplexobj(entry) else entry[..., None]
+            )
             shape = entry.shape[1:]
             for kept in _kept_axes(shape):
                 summed = parts.sum(axis=tuple(1 + i for i in range(len(shape)) if i not in kept))
@@ -136,6 +141,7 @@ def _best_per_site(
     fitted: Fit,
     projection: Projection,
     drawn: Replicates,
+    *,
     adjusted: Mapping[tuple[str, str], float],
     scores: Mapping[tuple[str, str], np.ndarray],
     values: Mapping[str, np.ndarray],

@@ -7,7 +7,7 @@ tangents of the model, scores are W^T e and the Fisher information is W^T W, wha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -39,18 +39,19 @@ class Observation:
         return jnp.where(self.parameters["mask"] > 0, rows, 0.0) if "mask" in self.parameters else rows
 
 
-_NAMES = {
-    "ComplexNormal": ("loc", "variance"),
-    "ComplexStudentT": ("loc", "variance", "tail"),
-    "Normal": ("loc", "scale"),
-    "LogNormal": ("loc", "scale"),
-    "StudentT": ("loc", "scale", "df"),
-    "BernoulliLogits": ("logits",),
-    "BernoulliProbs": ("probs",),
-    "Poisson": ("rate",),
-    "CategoricalLogits": ("logits",),
-    "CategoricalProbs": ("probs",),
+_FAMILIES: Mapping[str, tuple[Callable[..., Any], tuple[str, ...]]] = {
+    "ComplexNormal": (ComplexNormal, ("loc", "variance")),
+    "ComplexStudentT": (ComplexStudentT, ("loc", "variance", "tail")),
+    "Normal": (dist.Normal, ("loc", "scale")),
+    "LogNormal": (dist.LogNormal, ("loc", "scale")),
+    "StudentT": (dist.StudentT, ("loc", "scale", "df")),
+    "BernoulliLogits": (dist.Bernoulli, ("logits",)),
+    "BernoulliProbs": (dist.Bernoulli, ("probs",)),
+    "Poisson": (dist.Poisson, ("rate",)),
+    "CategoricalLogits": (dist.Categorical, ("logits",)),
+    "CategoricalProbs": (dist.Categorical, ("probs",)),
 }
+"""For each family its distribution and the names of the parameters."""
 
 
 def observation(fn: Any, value: Any, name: str) -> Observation:
@@ -62,19 +63,19 @@ def observation(fn: Any, value: Any, name: str) -> Observation:
     mask: Any = None
     while hasattr(fn, "base_dist") and not isinstance(fn, dist.LogNormal):
         if isinstance(fn, dist.MaskedDistribution):
-            mask = fn._mask if mask is None else mask & fn._mask
+            mask = fn._mask if mask is None else mask & fn._mask  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
         fn = fn.base_dist
     family = type(fn).__name__
-    if family not in _NAMES:
+    if family not in _FAMILIES:
         raise InputError(
             f"observed site {name!r}",
-            f"a distribution among {', '.join(_NAMES)}",
+            f"a distribution among {', '.join(_FAMILIES)}",
             family,
             "Declare the observation with one of these to diagnose its gap.",
         )
     shape = jnp.shape(value)
     parameters = {}
-    for parameter in _NAMES[family]:
+    for parameter in _FAMILIES[family][1]:
         array = jnp.asarray(getattr(fn, parameter))
         trailing = array.shape[-1:] if family.startswith("Categorical") else ()
         parameters[parameter] = jnp.broadcast_to(array, shape + trailing)
@@ -95,24 +96,8 @@ def sample(observed: Observation, key: jax.Array) -> jax.Array:
 
 def distribution(observed: Observation) -> Any:
     """The elementwise NumPyro distribution."""
-    p = observed.parameters
-    match observed.family:
-        case "ComplexNormal":
-            return ComplexNormal(p["loc"], p["variance"])
-        case "ComplexStudentT":
-            return ComplexStudentT(p["loc"], p["variance"], p["tail"])
-        case "Normal":
-            return dist.Normal(p["loc"], p["scale"])
-        case "LogNormal":
-            return dist.LogNormal(p["loc"], p["scale"])
-        case "StudentT":
-            return dist.StudentT(p["df"], p["loc"], p["scale"])
-        case "BernoulliLogits" | "BernoulliProbs":
-            return dist.Bernoulli(**{n: v for n, v in p.items() if n != "mask"})
-        case "Poisson":
-            return dist.Poisson(p["rate"])
-        case _:
-            return dist.Categorical(**{n: v for n, v in p.items() if n != "mask"})
+    parameters = {n: v for n, v in observed.parameters.items() if n != "mask"}
+    return _FAMILIES[observed.family][0](**parameters)
 
 
 def residual(observed: Observation, value: jax.Array) -> jax.Array:

@@ -7,9 +7,10 @@ from scipy import stats
 
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
-from dtprob.gap.screen import family_wise, gamma_tail, project, replicate, screen
+from dtprob.gap.screen import project, replicate, screen
 from dtprob.gap.search import view
 from dtprob.gap.settings import Settings
+from dtprob.gap.tails import family_wise, gamma_tail
 from dtprob.models.declaration import split_static
 from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation
 

@@ -41,7 +41,9 @@ def test_density_is_the_models(case):
 
 def test_columns_and_residuals_give_the_score_of_each_cluster(case):
     _, problem, x = case
-    score = jnp.einsum("cmk,cm->ck", problem.compiled.columns(x, np.eye(len(x))), problem.compiled.residual(x))
+    score = jnp.einsum(
+        "cmk,cm->ck", problem.compiled.columns(x, np.eye(len(x))), problem.compiled.residual(x)
+    )
     slope = jax.jacrev(lambda v: problem.compiled.evaluate(v)[0])(jnp.asarray(x))
     np.testing.assert_allclose(score, slope, rtol=1e-8, atol=1e-8 * float(jnp.abs(slope).max()))
 

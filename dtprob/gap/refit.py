@@ -1,0 +1,84 @@
+"""Full refits of a model with one more effect, from several starting points."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+
+from dtprob.effects.effect import Effect
+from dtprob.gap import fit as fitting
+from dtprob.gap.base import polish
+from dtprob.gap.plausible import scales, sides
+from dtprob.gap.problem import Problem
+from dtprob.gap.settings import Settings
+
+_LINES = 12
+"""Parameters of an effect along which starting points are looked for."""
+
+
+def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequence[np.ndarray]) -> fitting.Fit:
+    """The best of several refits with one more effect.
+
+    Args:
+        problem: in which the effect is live.
+        fitted: the fit without it.
+        effect: what is added.
+        starts: flat vectors; not looked at for a variance effect, whose field starts at zero.
+    """
+    names = (*fitted.effects, effect.name)
+    if effect.kind == "variance":
+        return fitting.fit(problem, fitted.x, names)
+    return max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
+
+
+def polished(problem: Problem, trials: Mapping[str, fitting.Fit], count: int) -> dict[str, fitting.Fit]:
+    """The trials, the best few freed from local optima.
+
+    The fit without an effect may have bent nuisances far away to imitate it; the refit has to find the way back.
+    """
+    best = sorted(trials, key=lambda name: -trials[name].log_evidence)[:count]
+    return {name: polish(problem, one) if name in best else one for name, one in trials.items()}
+
+
+def starting_points(
+    problem: Problem, x: np.ndarray, effect: Effect, step: np.ndarray | None, settings: Settings
+) -> list[np.ndarray]:
+    """The one-step estimate and the best local maxima of the log posterior along each parameter.
+
+    Args:
+        problem: in which the effect is live.
+        x: the fit without it.
+        effect: what is added.
+        step: the one-step estimate of its parameters, if there is one.
+        settings: how many trial sizes and starting points.
+    """
+    if effect.kind == "variance":
+        return []
+    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    scale, sided = scales(effect), sides(effect)
+    one_step = x.copy()
+    if step is not None:
+        moved = np.clip(step, -4 * scale, 4 * scale)
+        one_step[index] += np.where(sided, np.maximum(moved, 1e-3 * scale), moved)
+    lines = []
+    for j, position in enumerate(index[:_LINES]):
+        half = np.linspace(-2.5, 2.5, 2 * settings.grid + 1)
+        fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
+        offsets = np.unique(np.concatenate([half, fine, -fine])) * scale[j]
+        offsets = offsets[offsets >= 0] if sided[j] else offsets
+        line = np.repeat(x[None], len(offsets), axis=0)
+        line[:, position] += offsets
+        lines.append(line)
+    values = np.asarray(problem.compiled.profile(np.concatenate([one_step[None], *lines])))
+    best = [(float(values[0]), one_step)]
+    low = 1
+    for line in lines:
+        v = values[low : low + len(line)]
+        low += len(line)
+        padded = np.concatenate([[-np.inf], np.where(np.isfinite(v), v, -np.inf), [-np.inf]])
+        peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+        best += [(float(v[k]), line[k]) for k in peaks]
+    ordered = sorted(best[1:], key=lambda b: -b[0])[: settings.starts]
+    floor = values[0] if len(ordered) else -np.inf
+    return [one_step] + [start for value, start in ordered if value > floor - 5.0]

@@ -1,0 +1,51 @@
+"""Tail probabilities of score statistics, far beyond where they underflow, and of the smallest of many."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy import special, stats
+
+LOG_SMALLEST: Final = -660.0
+"""Logarithms below this are not turned into probabilities."""
+
+
+def family_wise(p: np.ndarray, replicate_p: np.ndarray) -> np.ndarray:
+    """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show."""
+    quantiles = np.quantile(np.maximum(replicate_p, 1e-300), [0.05, 0.1, 0.25, 0.5])
+    effective = np.log1p(-np.array([0.05, 0.1, 0.25, 0.5])) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
+    m = float(np.clip(np.max(effective), 1.0, 1e6))
+    return -np.expm1(m * np.log1p(-np.minimum(p, 1 - 1e-16)))
+
+
+def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Upper-tail p-value and normal quantile of a positive statistic with the given null mean and variance."""
+    nothing = mean <= 0
+    mean, variance = (
+        np.where(nothing, 1.0, mean),
+        np.where(nothing, 1.0, np.maximum(variance, 1e-12 * mean**2)),
+    )
+    observed = np.where(nothing, 1.0, observed)
+    log_p = np.where(nothing, 0.0, log_gamma_tail(observed * mean / variance, mean**2 / variance))
+    return np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
+
+
+def log_gamma_tail(value: np.ndarray, shape: np.ndarray | float) -> np.ndarray:
+    """Log upper-tail probability of a unit gamma, by its asymptote where the probability underflows."""
+    log_p = stats.gamma.logsf(value, shape)
+    far = (shape - 1) * np.log(np.maximum(value, 1e-300)) - value - special.gammaln(shape)
+    return np.where(np.isfinite(log_p), log_p, far)
+
+
+def field_log_bayes_factor(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Rough log Bayes factor of a random field, from the energy of its scores: nu/2 (r - 1 - log r) - log(nu)/2."""
+    safe = np.maximum(mean, 1e-300)
+    nu, ratio = 2 * safe**2 / np.maximum(variance, 1e-12 * safe**2), np.maximum(observed / safe, 1.0)
+    return np.where(mean > 0, nu / 2 * (ratio - 1 - np.log(ratio)) - np.log(nu) / 2, -np.inf)
+
+
+def normal_quantile(log_p: np.ndarray) -> np.ndarray:
+    """Normal quantile of an upper-tail probability given by its logarithm."""
+    far = np.sqrt(np.maximum(-2 * log_p - np.log(np.maximum(-4 * np.pi * log_p, 1e-12)), 0.0))
+    return np.where(log_p > LOG_SMALLEST, stats.norm.isf(np.exp(np.maximum(log_p, LOG_SMALLEST))), far)
