@@ -100,10 +100,10 @@ class VonMisesEM(AbstractEngine):
 
     The E-step updates one angle after the other, exactly; the M-step lowers the same free energy over the
     other latent sites (materials, noise power, concentrations), so the free energy never rises. The E-step
-    has local
-    optima: it starts from no error (all angles zero), from no knowledge (uniform angles) and, where the
-    data are Gaussian, from least squares; each group of coupled angles keeps the lowest. Once it has
-    settled it starts the E-step afresh, until that brings nothing more.
+    has local optima, above all where paths are hard to tell apart: it starts from no error (all angles
+    zero), from no knowledge (uniform angles), from directions spread over the circles and, where the data
+    are Gaussian, from least squares; each group of coupled angles keeps the lowest. Once it has settled it
+    starts the E-step afresh, until that brings nothing more.
 
     The posterior's `extra` has `free_energy`, its history `free_energy_history`, `converged`, and for each
     circular site `direction.<site>` (rad) and `concentration.<site>`.
@@ -113,6 +113,7 @@ class VonMisesEM(AbstractEngine):
         max_iterations: bound on the E- and M-steps.
         tolerance: stop when an iteration lowers the free energy by less than this, nats.
         newton_steps: optimiser steps in an M-step.
+        spread_starts: from how many spread directions the E-step starts.
         initial: constrained values that the sites without angles start from; by default the prior's median.
     """
 
@@ -124,13 +125,14 @@ class VonMisesEM(AbstractEngine):
     max_iterations: int = 200
     tolerance: float = 1e-4
     newton_steps: int = 3
+    spread_starts: int = 16
     initial: Mapping[str, Any] | None = None
 
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, {"draws": 1, "max_iterations": 1, "newton_steps": 1})
+        check_counts(self, {"draws": 1, "max_iterations": 1, "newton_steps": 1, "spread_starts": 0})
         layout_key, draw_key = jax.random.split(check_key(key))
         target, inputs = build_target(model, data)
         if not target.angles.size:
@@ -159,7 +161,7 @@ class VonMisesEM(AbstractEngine):
         values = target.latent_values(self.initial or {})
         rest = target.compiled(Target.prior_median)(inputs, values)
         nothing = jnp.zeros(layout.table.shape, rest.dtype)
-        stage = _restart(target, layout, VonMises(nothing, nothing), rest, inputs)
+        stage = self._restart(target, layout, VonMises(nothing, nothing), rest, inputs)
         history = [float(stage.free_energy)]
         with Progress(self.name, self.max_iterations, options.progress, options.status_file) as progress:
             for iteration in range(self.max_iterations):
@@ -167,12 +169,32 @@ class VonMisesEM(AbstractEngine):
                 settled = history[-1] - float(stage.free_energy) < self.tolerance
                 history.append(float(stage.free_energy))
                 if settled:
-                    stage = _restart(target, layout, stage.angles, stage.rest, inputs)
+                    stage = self._restart(target, layout, stage.angles, stage.rest, inputs)
                     history.append(float(stage.free_energy))
                     if history[-2] - history[-1] < self.tolerance:
                         return stage, history, True
                 progress.report(iteration + 1, "iterations", f"free energy {history[-1]:.6g} nats")
         return stage, history, False
+
+    def _restart(
+        self, target: Target, layout: Layout, angles: VonMises, rest: Array, inputs: Inputs
+    ) -> Stage:
+        """An E-step from where the angles are and from fresh starts."""
+        zero = -inputs.location[target.angles][layout.table]
+        fixed = jax.random.key(0)  # the same starts in every run
+        spread = jax.random.uniform(
+            fixed, (self.spread_starts, *zero.shape), zero.dtype, minval=-jnp.pi, maxval=jnp.pi
+        )
+        directions = jnp.concatenate([zero[None], spread])
+        starts = [
+            jax.tree.map(lambda leaf: leaf[None], angles.resultants),
+            Resultants(directions, jnp.ones_like(directions)),
+        ]
+        if is_gaussian(target):
+            found = target.compiled(least_squares_start)(layout, rest, inputs)
+            starts.append(jax.tree.map(lambda leaf: leaf[None], found))
+        form = target.compiled(quadratic)(layout, rest, inputs)
+        return _e_step(form, jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *starts), rest)
 
 
 def _facts(target: Target, inputs: Inputs, layout: Layout, stage: Stage) -> dict[str, np.ndarray]:
@@ -193,16 +215,6 @@ def _refine(target: Target, layout: Layout, stage: Stage, steps: int, inputs: In
     rest = target.compiled(_m_step, steps)(layout, stage, inputs)
     form = target.compiled(quadratic)(layout, rest, inputs)
     return _e_step(form, jax.tree.map(lambda leaf: leaf[None], stage.angles.resultants), rest)
-
-
-def _restart(target: Target, layout: Layout, angles: VonMises, rest: Array, inputs: Inputs) -> Stage:
-    """An E-step from where the angles are and from fresh starts."""
-    zero = -inputs.location[target.angles][layout.table]
-    starts = [angles.resultants, Resultants(zero, jnp.ones_like(zero))]
-    if is_gaussian(target):
-        starts.append(target.compiled(least_squares_start)(layout, rest, inputs))
-    form = target.compiled(quadratic)(layout, rest, inputs)
-    return _e_step(form, jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts), rest)
 
 
 def _m_step(target: Target, steps: int, layout: Layout, stage: Stage, inputs: Inputs) -> Array:

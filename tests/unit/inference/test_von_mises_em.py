@@ -27,22 +27,24 @@ def log_i0(kappa):
     return np.log(i0e(kappa)) + kappa
 
 
-def reference(response, h, concentration, noise, start):
-    """Free energy, directions and concentrations of one link by the closed-form coordinate update."""
-    m, kappa = start.astype(complex), np.zeros(len(response))
+def reference(response, h, concentration, noise, starts):
+    """Free energy, directions and concentrations of one link by the closed-form coordinate update, best start."""
+    m, kappa = np.array(starts, complex), np.zeros(np.shape(starts))
     for _ in range(3000):
         before = m.copy()
         for p in range(len(response)):
-            others = h - sum(m[q] * response[q] for q in range(len(response)) if q != p)
-            eta = concentration + 2 / noise * np.vdot(response[p], others)
-            kappa[p] = abs(eta)
-            m[p] = ratio(kappa[p]) * eta / abs(eta)
+            others = h - m @ response + m[:, p, None] * response[p]
+            eta = concentration + 2 / noise * others @ response[p].conj()
+            kappa[:, p] = abs(eta)
+            m[:, p] = ratio(kappa[:, p]) * eta / abs(eta)
         if np.max(np.abs(m - before)) < 1e-13:
             break
-    fit = np.sum(np.abs(h - m @ response) ** 2)
-    fit += np.sum(np.sum(np.abs(response) ** 2, 1) * (1 - np.abs(m) ** 2))
+    fit = np.sum(np.abs(h - m @ response) ** 2, axis=1)
+    fit += np.sum(np.sum(np.abs(response) ** 2, 1) * (1 - np.abs(m) ** 2), axis=1)
     terms = kappa * np.abs(m) - log_i0(kappa) - concentration * m.real + log_i0(concentration)
-    return len(h) * np.log(np.pi * noise) + fit / noise + terms.sum(), np.angle(m), kappa
+    energy = len(h) * np.log(np.pi * noise) + fit / noise + terms.sum(axis=1)
+    best = np.argmin(energy)
+    return energy[best], np.angle(m[best]), kappa[best]
 
 
 def least_squares(response, h, concentration, noise):
@@ -51,26 +53,22 @@ def least_squares(response, h, concentration, noise):
 
 
 def best_reference(data):
-    """The lower of the two starts for each link: no error, and least squares; and no knowledge."""
-    found = []
+    """The lowest for each link of many starts: no error, least squares, no knowledge, and random angles."""
+    random, found = np.random.default_rng(5), []
     for response, h in zip(data["response"], data["h"], strict=True):
         known = (data["concentration"], data["noise"])
-        starts = [np.ones(len(response)), least_squares(response, h, *known), np.zeros(len(response))]
-        found.append(min((reference(response, h, *known, s) for s in starts), key=lambda r: r[0]))
+        anywhere = np.exp(1j * random.uniform(-np.pi, np.pi, (40, len(response))))
+        ones = np.ones(len(response))
+        starts = [ones, least_squares(response, h, *known), 0 * ones, *anywhere]
+        found.append(reference(response, h, *known, starts))
     return [np.stack(part) for part in zip(*found, strict=True)]
 
 
 @pytest.mark.parametrize(
-    ("spread", "concentration"),
-    [
-        (1.0, 2.0),
-        pytest.param(
-            0.05, 0.5, marks=pytest.mark.xfail(reason="one link ends in a higher local optimum", strict=False)
-        ),
-    ],
+    ("spread", "concentration", "seed"), [(1.0, 2.0, 3), (0.05, 0.5, 3), (0.05, 0.5, 4), (0.05, 2.0, 5)]
 )
-def test_agrees_with_the_closed_form(spread, concentration):
-    data, _ = phase_errors_data(links=12, paths=4, spread=spread, concentration=concentration)
+def test_agrees_with_the_closed_form(spread, concentration, seed):
+    data, _ = phase_errors_data(links=12, paths=4, spread=spread, concentration=concentration, seed=seed)
     posterior = VonMisesEM(draws=10)(KEY, phase_errors, data)
     energy, direction, kappa = best_reference(data)
     assert float(posterior.extra["free_energy"]) <= energy.sum() + 1e-5
