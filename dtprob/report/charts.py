@@ -15,7 +15,7 @@ from dtprob.report.figures import (
     interval_plot,
     plan_view,
 )
-from dtprob.report.json_schema import Report
+from dtprob.report.json_schema import Interval, Report
 from dtprob.report.names import capital, together, words
 from dtprob.report.svg import inline_svg
 from dtprob.report.units import number, scale_for
@@ -32,10 +32,13 @@ class Chart:
     caption: str
 
 
-def gap_chart(report: Report) -> Chart:
-    """The loss before and after, against the lowest possible."""
+def gap_chart(report: Report) -> Chart | None:
+    """The loss before and after, against the lowest possible; None where the loss is not determined."""
     gap = report["gap"]
-    floor = None if gap["floor"] is None else (float(gap["floor"][0]), float(gap["floor"][1]))
+    if gap["before"] is None:
+        return None
+    lowest, highest = gap["floor"] or (None, None)
+    floor = None if lowest is None or highest is None else (lowest, highest)
     told = [f"Loss of the twin as it is: {number(gap['before'])} {gap['unit']}."]
     if gap["after"] is not None:
         told.append(f"With the cause: {number(gap['after'])}.")
@@ -51,11 +54,9 @@ def gap_chart(report: Report) -> Chart:
 def closing_chart(report: Report) -> Chart | None:
     """The closed fraction of each cause, where there are several to compare, but not too many."""
     rows = [
-        IntervalRow(
-            capital(together(cause["effects"])), *(100 * closed[key] for key in ("mean", "low", "high"))
-        )
+        IntervalRow(capital(together(cause["effects"])), *shares)
         for cause in report["causes"]
-        if (closed := cause["closed_fraction"]) is not None
+        if (shares := _in_percent(cause["closed_fraction"])) is not None
     ]
     if not 2 <= len(rows) <= 12:
         return None
@@ -65,6 +66,13 @@ def closing_chart(report: Report) -> Chart | None:
         inline_svg(figure, f"Share of the gap closed: {told}."),
         "How much of the gap each cause closes when it is added alone, with 90% intervals.",
     )
+
+
+def _in_percent(closed: Interval | None) -> tuple[float, float, float] | None:
+    """Mean, low and high of a share in percent; None where one of them is not determined."""
+    if closed is None or closed["mean"] is None or closed["low"] is None or closed["high"] is None:
+        return None
+    return 100 * closed["mean"], 100 * closed["low"], 100 * closed["high"]
 
 
 def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
@@ -176,7 +184,4 @@ def all_charts(report: Report, gap: xr.DataTree | None) -> Iterator[tuple[str, C
     if report["verdict"] == "NO_GAP":  # bars and colours would make noise look like a finding
         return
     yield from (("plan", chart) for chart in plan_charts(report, gap))
-    yield "far", gap_chart(report)
-    closing = closing_chart(report)
-    if closing is not None:
-        yield "far", closing
+    yield from (("far", chart) for chart in (gap_chart(report), closing_chart(report)) if chart is not None)

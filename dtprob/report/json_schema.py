@@ -1,4 +1,8 @@
-"""What report.json holds, as types, and the check that a report keeps to them."""
+"""What report.json holds, as types, and the check that a report keeps to them.
+
+JSON has no infinity and no NaN: a number that the data do not determine, or that has no bound, is null. A
+field that may be so says `Number` or `| None`; every other number must be there and be finite.
+"""
 
 import json
 import math
@@ -21,19 +25,20 @@ from typing import (
 from dtprob.errors import InputError, unknown_name
 
 type Verdict = Literal["NO_GAP", "LISTED", "LISTED_WITH_REMAINDER", "UNLISTED", "UNDETERMINED"]
+type Number = float | None
 type Probability = Annotated[float, "0 to 1"]
 type Range = tuple[float, float]
-type BeforeAfter = tuple[float, float | None]
+type BeforeAfter = tuple[Number, Number]
 
 VERDICTS: tuple[str, ...] = get_args(Verdict.__value__)
 
 
 class Interval(TypedDict):
-    """A mean with its 90% interval."""
+    """A mean with its 90% interval; an end is null where the interval has none on that side."""
 
-    mean: float
-    low: float
-    high: float
+    mean: Number
+    low: Number
+    high: Number
 
 
 class Size(Interval):
@@ -45,7 +50,7 @@ class Size(Interval):
 class Strata(TypedDict):
     """The estimate of the cause's first size, made apart in each part of the data."""
 
-    estimate: list[float]
+    estimate: list[Number]
 
 
 class Cause(TypedDict):
@@ -65,8 +70,8 @@ class Site(TypedDict):
     """A site of the model, with its share of the gap; `family` says how it must change to close it."""
 
     site: str
-    p_value: Probability
-    share: float
+    p_value: Probability | None
+    share: Number
     family: NotRequired[str]
 
 
@@ -74,8 +79,8 @@ class Coordinates(TypedDict):
     """A block of the data: for each axis its first and last coordinate; with its share of the gap."""
 
     axes: dict[str, Range]
-    p_value: Probability
-    share: float
+    p_value: Probability | None
+    share: Number
 
 
 class Where(TypedDict):
@@ -89,9 +94,9 @@ class Gap(TypedDict):
     """How far: held-out loss before and after the accepted cause; `floor` brackets the lowest possible."""
 
     unit: str
-    before: float
-    after: float | None
-    floor: Range | None
+    before: Number
+    after: Number
+    floor: tuple[Number, Number] | None
     in_user_terms: dict[str, BeforeAfter]
 
 
@@ -103,10 +108,10 @@ class Unlisted(TypedDict):
 
 
 class Detectable(TypedDict):
-    """The smallest size of an effect that would have been noticed."""
+    """The smallest size of an effect that would have been noticed; null where none would have been."""
 
     effect: str
-    size: float
+    size: Number
     unit: NotRequired[str]
     parameter: NotRequired[str]
 
@@ -116,7 +121,7 @@ class Candidate(TypedDict):
 
     effect: str
     sites: list[str]
-    z: float | None
+    z: Number
     p_value: Probability | None
     adjusted_p_value: Probability | None
     absorbed_by: NotRequired[str | None]
@@ -128,7 +133,7 @@ class Nuisance(Interval):
 
     name: str
     unit: NotRequired[str]
-    contraction: NotRequired[float | None]
+    contraction: NotRequired[Number]
 
 
 class Fit(TypedDict):
@@ -215,8 +220,9 @@ def _check_record(value: Any, kind: Any, where: str) -> None:
             _check(value[name], hints[name], f"{where}.{name}")
         elif name in kind.__required_keys__:
             raise InputError(where, f"the key '{name}'", f"the keys {', '.join(value)}", f"Add '{name}'")
-    if {"low", "high"} <= hints.keys() and value["low"] > value["high"]:
-        raise _wrong(where, "low <= high", f"low {value['low']} and high {value['high']}")
+    low, high = value.get("low"), value.get("high")
+    if low is not None and high is not None and low > high:
+        raise _wrong(where, "low <= high", f"low {low} and high {high}")
 
 
 def _check_union(value: Any, kinds: Sequence[Any], where: str) -> None:

@@ -9,7 +9,7 @@ from dtprob.report.advice import family
 from dtprob.report.json_schema import Cause, Coordinates, Detectable, Interval, Site, Size
 from dtprob.report.units import (
     Reading,
-    decimals_for,
+    decimals_between,
     number,
     percent,
     quantity,
@@ -98,21 +98,22 @@ def size_reading(name: str, size: Size) -> tuple[str, Reading]:
     return label, reading(size["mean"], size["low"], size["high"], _unit(name, size))
 
 
-def apart(name: str, size: Size, estimates: Sequence[float]) -> str:
+def apart(name: str, size: Size, estimates: Sequence[float | None]) -> str:
     """Estimates of one parameter from several parts of the data, in the unit of its size."""
     scale = scale_for([size["mean"], size["low"], size["high"], *estimates], _unit(name, size))
-    decimals = decimals_for(scale(size["high"]) - scale(size["low"]))
+    decimals = decimals_between(scale(size["low"]), scale(size["high"]))
     return with_unit(listing(number(scale(value), decimals) for value in estimates), scale.unit)
 
 
 def shares(interval: Interval) -> str:
     """An interval of shares: `88 to 97%`."""
-    return f"{percent(max(interval['low'], 0.0)).rstrip('%')} to {percent(interval['high'])}"
+    low, high = interval["low"], interval["high"]
+    return f"{percent(low if low is None else max(low, 0.0)).rstrip('%')} to {percent(high)}"
 
 
 def significant[Located: (Site, Coordinates)](located: Iterable[Located]) -> list[Located]:
     """The sites or blocks whose share of the gap is hardly chance."""
-    return [entry for entry in located if entry["p_value"] <= LEVEL]
+    return [entry for entry in located if entry["p_value"] is not None and entry["p_value"] <= LEVEL]
 
 
 def term(name: str) -> str:
@@ -123,12 +124,12 @@ def term(name: str) -> str:
     return words(stem)
 
 
-def user_terms(name: str, before: float, after: float | None) -> list[str]:
+def user_terms(name: str, before: float | None, after: float | None) -> list[str]:
     """Numbers in the user's own terms before and after (where there is an after), in one unit."""
     values = [before] if after is None else [before, after]
     unit = split_unit(name)[1]
     scale = scale_for(values, unit)
-    decimals = 1 if unit == "dB" else decimals_for(abs(scale(values[-1]) - scale(values[0])))
+    decimals = 1 if unit == "dB" else decimals_between(scale(values[0]), scale(values[-1]))
     return [with_unit(number(scale(value), decimals), scale.unit) for value in values]
 
 
@@ -150,7 +151,7 @@ def block(entry: Coordinates) -> str:
 
 
 def detectable_families(entries: Iterable[Detectable]) -> list[DetectableFamily]:
-    """For each family and unit the size from which every instance would have been seen."""
+    """For each family and unit the size from which every instance would have been seen, a dash for none."""
     groups: dict[tuple[str, str, str], list[Detectable]] = {}
     for entry in entries:
         key = (family(entry["effect"]), entry.get("parameter", ""), entry.get("unit", "1"))
@@ -159,11 +160,18 @@ def detectable_families(entries: Iterable[Detectable]) -> list[DetectableFamily]
         DetectableFamily(
             words(name),
             words(parameter),
-            quantity(max(entry["size"] for entry in group), unit, 2),
+            quantity(_largest(entry["size"] for entry in group), unit, 2),
             len(group),
         )
         for (name, parameter, unit), group in groups.items()
     ]
+
+
+def _largest(sizes: Iterable[float | None]) -> float | None:
+    """The largest size; None, which has no bound, is larger than any."""
+    found = list(sizes)
+    known = [size for size in found if size is not None]
+    return max(known) if len(known) == len(found) else None
 
 
 def aliases(cause: Cause) -> list[list[str]]:

@@ -61,12 +61,15 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
     )
 
 
-def bar(size: Interval) -> Bar:
-    """Where an interval lies on a track that also shows zero, with a margin at both ends."""
-    low, high = min(size["low"], size["mean"], 0.0), max(size["high"], size["mean"], 0.0)
+def bar(size: Interval) -> Bar | None:
+    """Where an interval lies on a track that also shows zero, with a margin at both ends; None if unbounded."""
+    least, mean, most = size["low"], size["mean"], size["high"]
+    if least is None or mean is None or most is None:
+        return None
+    low, high = min(least, mean, 0.0), max(most, mean, 0.0)
     span = (high - low) or 1.0
     low, span = low - 0.06 * span, 1.12 * span
-    place = [round(100 * (value - low) / span, 2) for value in (size["low"], size["high"], size["mean"], 0.0)]
+    place = [round(100 * (value - low) / span, 2) for value in (least, most, mean, 0.0)]
     return Bar(place[0], place[1], place[2], place[3])
 
 

@@ -19,7 +19,7 @@ from dtprob.report.names import (
     together,
     words,
 )
-from dtprob.report.units import percent
+from dtprob.report.units import DASH, percent
 
 
 @dataclass(frozen=True)
@@ -96,9 +96,10 @@ def _no_gap(report: Report) -> Story:
 
 
 def _seen(detectable: list[Detectable]) -> str:
-    if not detectable:
+    families = [entry for entry in detectable_families(detectable) if entry.size != DASH]
+    some = [f"{entry.name} of {entry.size}" for entry in families[:3]]
+    if not some:
         return "How large an effect would have been seen is not known."
-    some = [f"{entry.name} of {entry.size}" for entry in detectable_families(detectable)[:3]]
     return (
         f"Effects larger than these would have been seen: {listing(some)}. Smaller ones cannot be ruled out."
     )
@@ -178,7 +179,7 @@ def _looks_alike(cause: Cause) -> str:
 
 def _closing(cause: Cause) -> str:
     closed = cause["closed_fraction"]
-    if closed is None:
+    if closed is None or closed["mean"] is None:
         return "How much of the gap this closes could not be established."
     return (
         f"Added to the twin, this closes {percent(closed['mean'])} of the gap "

@@ -4,6 +4,10 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
+
+DASH = "–"
+"""Stands for a number that is not determined."""
 
 _NARROW = "\u202f"
 _MINUS = "\u2212"
@@ -33,8 +37,14 @@ class Scale:
     unit: str
     is_dbm: bool = False
 
-    def __call__(self, value: float) -> float:
-        """The number to show."""
+    @overload
+    def __call__(self, value: float) -> float: ...
+    @overload
+    def __call__(self, value: float | None) -> float | None: ...
+    def __call__(self, value: float | None) -> float | None:
+        """The number to show; None stays None."""
+        if value is None:
+            return None
         return 10 * math.log10(value * 1e3) if self.is_dbm else value * self.factor
 
 
@@ -59,6 +69,8 @@ class Reading:
     @property
     def interval(self) -> str:
         """`low to high unit`."""
+        if self.low == self.high == DASH:
+            return DASH
         return f"{self.low} to {with_unit(self.high, self.unit)}"
 
 
@@ -68,8 +80,9 @@ def split_unit(name: str) -> tuple[str, str]:
     return (stem, _SUFFIXES[suffix]) if stem and suffix in _SUFFIXES else (name, "1")
 
 
-def scale_for(values: Sequence[float], unit: str) -> Scale:
-    """The scale that suits the largest magnitude among `values`, given in the SI unit `unit`."""
+def scale_for(numbers: Sequence[float | None], unit: str) -> Scale:
+    """The scale that suits the largest magnitude among `numbers`, given in the SI unit `unit`."""
+    values = [value for value in numbers if value is not None]
     if unit in _FACTORS:
         return Scale(*_FACTORS[unit])
     if unit == "W" and values and min(values) > 0:
@@ -87,8 +100,10 @@ def scale_for(values: Sequence[float], unit: str) -> Scale:
     return Scale(1 / factor, label)
 
 
-def number(value: float, decimals: int | None = None, digits: int = 3) -> str:
+def number(value: float | None, decimals: int | None = None, digits: int = 3) -> str:
     """A number with a true minus and `decimals`, or else `digits`; a power of ten where that is shorter."""
+    if value is None:
+        return DASH
     if value == 0:
         return "0"
     if not 1e-4 <= abs(value) < 1e6:
@@ -106,19 +121,19 @@ def number(value: float, decimals: int | None = None, digits: int = 3) -> str:
 
 def with_unit(text: str, unit: str) -> str:
     """A number and its unit, which stay on one line."""
-    return text if not unit else f"{text}{'' if unit in {'°', '%'} else _NARROW}{unit}"
+    return text if not unit or text == DASH else f"{text}{'' if unit in {'°', '%'} else _NARROW}{unit}"
 
 
-def quantity(value: float, unit: str, digits: int = 3) -> str:
+def quantity(value: float | None, unit: str, digits: int = 3) -> str:
     """One number of the SI unit `unit`, in the unit that people read."""
     scale = scale_for([value], unit)
     return with_unit(number(scale(value), digits=digits), scale.unit)
 
 
-def reading(mean: float, low: float, high: float, unit: str) -> Reading:
+def reading(mean: float | None, low: float | None, high: float | None, unit: str) -> Reading:
     """A mean and its interval in one human unit, with two digits of the interval's width."""
     scale = scale_for([mean, low, high], unit)
-    decimals = decimals_for(scale(high) - scale(low))
+    decimals = decimals_between(scale(low), scale(high))
     texts = [number(scale(value), decimals) for value in (mean, low, high)]
     return Reading(texts[0], texts[1], texts[2], scale.unit)
 
@@ -128,6 +143,11 @@ def decimals_for(width: float) -> int | None:
     return min(6, max(0, 1 - math.floor(math.log10(width)))) if width > 0 else None
 
 
+def decimals_between(low: float | None, high: float | None) -> int | None:
+    """The decimals for an interval, or for two numbers to compare; None where one is not determined."""
+    return None if low is None or high is None else decimals_for(abs(high - low))
+
+
 def chance(probability: float) -> str:
     """A probability in percent, never certainty."""
     if probability < 0.01:
@@ -135,13 +155,17 @@ def chance(probability: float) -> str:
     return "> 99%" if probability > 0.99 else percent(probability)
 
 
-def percent(value: float) -> str:
+def percent(value: float | None) -> str:
     """A share in percent."""
+    if value is None:
+        return DASH
     return f"{100 * value:.0f}%".replace("-", _MINUS)
 
 
-def p_value(value: float) -> str:
+def p_value(value: float | None) -> str:
     """A p-value with two digits, as a power of ten below 0.0001."""
+    if value is None:
+        return DASH
     if value == 0:
         return "< 10⁻³⁰⁰"
     return f"{value:.2f}" if value >= 0.1 else number(value, max(2, 1 - math.floor(math.log10(value))))
