@@ -180,6 +180,11 @@ def n_snapshot(sites: Sites) -> int:
     return max((site.shape[site.axes.index("snapshot")] for site in observed), default=1)
 
 
+def n_link(context: Data) -> int:
+    """Number of links in this run of a model with paths."""
+    return context["path_gain"].shape[0]
+
+
 def n_antenna(sites: Sites, side: str) -> int:
     """Number of antennas at one end, 1 where the model has no response for it."""
     name = f"{side}_response"

@@ -18,6 +18,8 @@ from dtprob.effects.common import (
     complex_of,
     half_normal,
     has_phase,
+    n_link,
+    n_snapshot,
     normal,
     offers,
 )
@@ -147,17 +149,23 @@ def phase_error(sites: Sites, _data: Data) -> list[Effect]:
     """Every path has a random phase of its own, beyond what the geometry tells."""
     if not has_phase(sites) or not offers(sites, "path_phase") or _has_path_phases(sites):
         return []
-    return [
-        Effect(
-            "phase_error",
-            {"path_phase": lambda value, p, _: value + p["scale"] * p[FIELD]},
-            (half_normal("scale", 0.5, "rad"),),
-            kind="variance",
-            physics="Independent phase of every path: positions off by fractions of a wavelength.",
-            source="Ruah et al., arXiv 2312.12625, the von Mises error in its Gaussian limit.",
-            field_shape=lambda value, context: (*value.shape[:2], context["path_gain"].shape[1]),
-        )
-    ]
+    effects = [_phase_error(None, 1, "as positions off by fractions of a wavelength make it")]
+    if n_snapshot(sites) > 1:
+        effects.append(_phase_error("each_packet", n_snapshot(sites), "new in every snapshot"))
+    return effects
+
+
+def _phase_error(instance: str | None, count: int, reason: str) -> Effect:
+    return Effect(
+        "phase_error",
+        {"path_phase": lambda value, p, _: value + p["scale"] * p[FIELD]},
+        (half_normal("scale", 0.5, "rad"),),
+        instance=instance,
+        kind="variance",
+        physics=f"Independent phase of every path, {reason}.",
+        source="Ruah et al., arXiv 2312.12625, the von Mises error in its Gaussian limit.",
+        field_shape=lambda _, context: (n_link(context), count, context["path_gain"].shape[1]),
+    )
 
 
 def diffuse_reflection(sites: Sites, _data: Data) -> list[Effect]:

@@ -21,6 +21,9 @@ from dtprob.gap.plausible import mixing_gain, nulls, scales, sides
 from dtprob.gap.problem import Problem
 
 _TRIES: Final = 8
+_SETTLED: Final = 0.01
+"""Change of the logarithm of a field's standard deviation below which it stands."""
+_FEWEST, _FAINTEST = 0.5, 1e-9
 _STUCK: Final = 1e3
 """Damping beyond which a fit has arrived, whatever its quadratic promises."""
 
@@ -120,14 +123,16 @@ def fit(
     for _ in range(steps):
         system = _system(problem, active, x)
         trial = _better(problem, active, system, x, value=value, damping=damping, tolerance=tolerance)
-        if trial.value > value:
+        better = trial.value > value
+        converged = trial.gain < tolerance or (not better and trial.damping > _STUCK)
+        if better:
             x, value, damping = trial.x, trial.value, trial.damping / 8
-            active, value = _respread(problem, active, x, system, value)
-            converged = trial.gain < tolerance
-        else:
-            converged = trial.gain < tolerance or trial.damping > _STUCK
-            break
-        if converged:
+        change = 0.0
+        if active.spread:
+            active, change = _respread(problem, active, x, system)
+            value = _weighted(active, _objective(problem, active, x))
+        converged = converged and change < _SETTLED
+        if converged or not (better or change >= _SETTLED):
             break
     return _finish(problem, active, x, value, converged)
 
@@ -185,31 +190,27 @@ def _lowest(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     return lowest[active.global_index]
 
 
-def _respread(
-    problem: Problem, active: Active, x: np.ndarray, system: System, value: float
-) -> tuple[Active, float]:
-    """EM update of the standard deviations of variance effects: second moment of the field under its posterior."""
-    if not active.spread:
-        return active, value
-    spread = dict(active.spread)
-    l_index = active.local_index
-    posterior = np.linalg.inv(positive(system.local)) if l_index.shape[1] else None
-    for effect in active.effects:
-        if effect.kind != "variance":
-            continue
-        moments = []
-        for block in problem.blocks_of(effect.name):
-            variance = np.zeros(block.index.shape)
-            if block.local and posterior is not None:
-                position = {int(i): j for j, i in enumerate(l_index[0])}
-                columns = [position[int(i)] for i in block.index[0]]
-                variance = np.einsum("cii->ci", posterior)[:, columns]
-            moments.append(
-                (x[block.index] ** 2 + variance)[active.weights > 0] if block.local else x[block.index] ** 2
-            )
-        spread[effect.name] = float(np.sqrt(np.mean(np.concatenate([m.ravel() for m in moments]))) + 1e-9)
-    active = replace(active, spread=spread)
-    return active, _weighted(active, _objective(problem, active, x))
+def _respread(problem: Problem, active: Active, x: np.ndarray, system: System) -> tuple[Active, float]:
+    """New standard deviations of variance effects, and the largest change of their logarithms.
+
+    sd^2 <- sum x^2 / gamma, gamma = sum (1 - var / sd^2) the number of entries that the data determine (MacKay, Neural
+    Computation 4 (1992) 415): the same fixed point as EM, reached in fewer steps; no step is longer than a factor of 3.
+    """
+    spread, change = dict(active.spread), 0.0
+    own = np.zeros(problem.dimension)
+    own[active.global_index] = np.diag(np.linalg.inv(positive(system.curvature)))
+    if active.local_index.size:
+        own[active.local_index] = np.einsum("cii->ci", np.linalg.inv(positive(system.local)))
+    for name, sd in active.spread.items():
+        blocks = problem.blocks_of(name)
+        kept = [b.index[active.weights > 0] if b.local else b.index for b in blocks]
+        index = np.concatenate([i.reshape(-1) for i in kept])
+        determined = max(float(np.sum(1 - own[index] / sd**2)), _FEWEST)
+        ratio = np.sqrt(np.sum(x[index] ** 2) / determined) / sd
+        ratio = float(np.clip(ratio, 1 / 3, 3.0))
+        spread[name] = max(sd * ratio, _FAINTEST)
+        change = max(change, abs(np.log(spread[name] / sd)))
+    return replace(active, spread=spread), change
 
 
 def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, converged: bool) -> Fit:

@@ -222,7 +222,8 @@ class Problem:
             context = {**data, **{n: m["value"] for n, m in trace.items()}}
             for effect in self.live:
                 if effect.kind == "variance":
-                    value = trace[effect.sites[0]]["value"]
+                    grown = self.float_sites[effect.sites[0]]
+                    value = jnp.broadcast_to(trace[effect.sites[0]]["value"], grown.shape)
                     shapes[effect.site_name(FIELD)] = jnp.zeros(effect.shape_of_field(value, context))
             return shapes
 

@@ -84,7 +84,12 @@ class Programs:
     def field_energy(
         self, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array]
     ) -> dict[str, np.ndarray]:
-        """Sum of squared field scores (n,) of each variance effect, from site gradients (n, *site)."""
+        """Weighted sums of squared field scores (n, weighting) of each variance effect, the first with equal weights.
+
+        Args:
+            values: of the sites, at the fit.
+            gradients: of the data and then of replicates under the fit, (n, *site) for each site.
+        """
         found = self._energy(dict(values), dict(gradients), self._arrays)
         return {name: np.asarray(value) for name, value in found.items()}
 
@@ -139,4 +144,26 @@ def _field_energy(
         return result
 
     _, pull = jax.vjp(moved, jnp.zeros(shape))
-    return jax.lax.map(lambda g: jnp.sum(pull(g)[0] ** 2), {site: gradients[site] for site in sites})
+    chosen = {site: gradients[site] for site in sites}
+
+    def square(gradient: Mapping[str, jax.Array]) -> jax.Array:
+        return pull(gradient)[0] ** 2
+
+    def add(total: jax.Array, gradient: Mapping[str, jax.Array]) -> tuple[jax.Array, None]:
+        return total + square(gradient), None
+
+    replicates = {site: value[1:] for site, value in chosen.items()}
+    total, _ = jax.lax.scan(add, jnp.zeros(shape), replicates)
+    information = total / max(len(next(iter(replicates.values()))), 1)
+    return jax.lax.map(lambda g: _weights(information) @ square(g).reshape(-1), chosen)
+
+
+def _weights(information: jax.Array) -> jax.Array:
+    """Weights (1 + reference, entry) of squared scores: equal for a faint field, inverse to the information for a strong.
+
+    The best test of entries with variance s^2 weights them by 1 / (1 + s^2 J); s^2 J is 1 at quantiles of J in turn.
+    """
+    flat = information.reshape(-1)
+    reference = jnp.quantile(flat, jnp.array([0.9, 0.5, 0.1])) * jnp.array([1.0, 1.0, 0.1])
+    reference = jnp.maximum(reference, 1e-12 * jnp.max(flat, initial=0.0) + 1e-300)
+    return jnp.concatenate([jnp.ones((1, flat.size)), 1.0 / (1.0 + flat / reference[:, None])])

@@ -15,6 +15,8 @@ from dtprob.gap.settings import Settings
 
 _LINES = 12
 """Parameters of an effect along which starting points are looked for."""
+_REACH = 0.4
+"""Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
 
 def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequence[np.ndarray]) -> fitting.Fit:
@@ -32,12 +34,25 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     return max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
 
 
-def polished(problem: Problem, trials: Mapping[str, fitting.Fit], count: int) -> dict[str, fitting.Fit]:
-    """The trials, the best few freed from local optima.
+def polished(
+    problem: Problem, before: fitting.Fit, trials: Mapping[str, fitting.Fit], count: int
+) -> dict[str, fitting.Fit]:
+    """The trials, those in reach of the best freed from local optima.
 
-    The fit without an effect may have bent nuisances far away to imitate it; the refit has to find the way back.
+    The fit without an effect may have bent nuisances far away to imitate it; the refit has to find the way back. Random
+    fields are left as they are: they can do without.
+
+    Args:
+        problem: in which the trials' effects are live.
+        before: the fit without them.
+        trials: refits by the effect's name.
+        count: so many at most are worked on.
     """
-    best = sorted(trials, key=lambda name: -trials[name].log_evidence)[:count]
+    kinds = {e.name: e.kind for e in problem.effects}
+    gain = {name: one.log_evidence - before.log_evidence for name, one in trials.items()}
+    reach = _REACH * max(gain.values(), default=0.0)
+    able = [name for name in trials if kinds[name] == "mean" and gain[name] >= reach]
+    best = sorted(able, key=lambda name: -gain[name])[:count]
     return {name: polish(problem, one) if name in best else one for name, one in trials.items()}
 
 

@@ -18,14 +18,13 @@ from scipy import stats
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.directions import Tangents, surroundings, tangents
+from dtprob.gap.fields import field_tests
 from dtprob.gap.plausible import log_bayes_factor, scales
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import (
     LOG_SMALLEST,
     family_wise,
-    field_log_bayes_factor,
-    gamma_tail,
     log_gamma_tail,
     normal_quantile,
 )
@@ -156,34 +155,20 @@ def screen(
     around = surroundings(problem, fitted.x)
     scores = _mean_scores(problem, fitted, projection, drawn, tangents(around, means, problem.programs))
     energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
-    statistic = np.stack([energy[e.name] for e in fields], -1) if fields else None
+    tested = field_tests(energy, [e.name for e in fields], len(drawn.projected))
     mean_p, mean_z = _mean_tests(scores, scores.u[None])
-    null_p = _mean_tests(scores, scores.u_null)[0]
-    if statistic is None:
-        variance_p, variance_z, replicate_p = (
-            np.ones((1, 0)),
-            np.zeros((1, 0)),
-            null_p.min(axis=1, initial=1.0),
-        )
-        variance_bf = np.zeros(0)
-    else:
-        null = statistic[1:]
-        variance_p, variance_z = gamma_tail(statistic[:1], null.mean(0), null.var(0))
-        variance_bf = field_log_bayes_factor(statistic[0], null.mean(0), null.var(0))
-        variance_null = gamma_tail(null, null.mean(0), null.var(0))[0]
-        # The fields' replicates are the first of the same data sets.
-        replicate_p = np.minimum(
-            null_p[: len(null)].min(axis=1, initial=1.0), variance_null.min(axis=1, initial=1.0)
-        )
-    p = np.concatenate([mean_p[0], variance_p[0]])
+    null_p = _mean_tests(scores, scores.u_null)[0].min(axis=1, initial=1.0)
+    # The fields' replicates are the first of the same data sets.
+    replicate_p = np.minimum(null_p[: len(tested.replicates)], tested.replicates) if fields else null_p
+    smallest = np.concatenate([mean_p[0], tested.smallest])
     names = [e.name for e in (*means, *fields)]
     order = np.array([names.index(c.name) for c in candidates], int)
-    log_bf = np.concatenate([scores.log_bayes_factor, variance_bf])
+    log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
     return Screening(
         names=tuple(c.name for c in candidates),
-        z=np.concatenate([mean_z[0], variance_z[0]])[order],
-        p_value=p[order],
-        adjusted=family_wise(p, replicate_p)[order],
+        z=np.concatenate([mean_z[0], tested.z])[order],
+        p_value=np.concatenate([mean_p[0], tested.p_value])[order],
+        adjusted=family_wise(smallest, replicate_p)[order],
         log_bayes_factor=log_bf[order],
         step={e.name: scores.step(k) for k, e in enumerate(means)},
         absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),

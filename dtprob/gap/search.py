@@ -24,6 +24,8 @@ from dtprob.gap.where import Location, locate
 type Say = Callable[[str], None]
 
 _LARGEST_FIELD = 96
+_PREFERRED = 0.9
+"""Share of a random field's evidence at which an effect with parameters of its own is preferred."""
 _LARGE_GAP = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 
@@ -115,7 +117,7 @@ def _accept(
     gain = {name: trial.log_evidence - fitted.log_evidence for name, trial in trials.items()}
     best = max(gain, key=lambda name: gain[name])
     plain = {name: value for name, value in gain.items() if kinds[name] == "mean"}
-    if plain and max(plain.values()) >= settings.relevance * gain[best]:
+    if plain and max(plain.values()) >= _PREFERRED * gain[best]:
         best = max(plain, key=lambda name: plain[name])
     so_far = fitted.log_evidence - base.log_evidence
     needed = max(np.log(len(kinds)) + 3.0, settings.minor * so_far)
@@ -143,7 +145,7 @@ def _trials(
         if name in found:
             starts.append(_scanned_start(problem, seen.problem, effects[name], found[name]))
         trials[name] = refit(problem, start, effects[name], starts)
-    return problem, polished(problem, trials, settings.polished)
+    return problem, polished(problem, fitted, trials, settings.polished)
 
 
 def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:

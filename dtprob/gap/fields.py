@@ -1,0 +1,58 @@
+"""Tests of variance effects: are the scores of a random field larger than the fitted model allows?
+
+One-sided second-order score tests, each with a few weightings of the field's entries, calibrated by replicates.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from dtprob.gap.tails import family_wise, field_log_bayes_factor, gamma_tail
+
+
+class FieldTests(NamedTuple):
+    """Results for each variance effect.
+
+    Attributes:
+        smallest: smallest p-value over weightings.
+        p_value: the same, with the choice of the weighting accounted for.
+        z: largest normal quantile over weightings.
+        log_bayes_factor: rough, of the best weighting.
+        replicates: smallest p-value over effects and weightings of each replicate.
+    """
+
+    smallest: Float[np.ndarray, " effect"]
+    p_value: Float[np.ndarray, " effect"]
+    z: Float[np.ndarray, " effect"]
+    log_bayes_factor: Float[np.ndarray, " effect"]
+    replicates: Float[np.ndarray, " replicate"]
+
+
+def field_tests(
+    energies: Mapping[str, Float[np.ndarray, "n weighting"]], names: Sequence[str], n: int
+) -> FieldTests:
+    """Test variance effects.
+
+    Args:
+        energies: weighted sums of squared scores, of the data and then of replicates.
+        names: the effects, in the order of the results.
+        n: number of replicates.
+    """
+    smallest, p_value, z, bayes, replicates = [], [], [], [], [np.ones(n)]
+    for name in names:
+        observed, null = energies[name][0], energies[name][1:]
+        mean, variance = null.mean(axis=0), null.var(axis=0)
+        p, quantile = gamma_tail(observed, mean, variance)
+        null_p = gamma_tail(null, mean, variance)[0].min(axis=1)
+        smallest.append(float(p.min()))
+        p_value.append(float(family_wise(p.min()[None], null_p)[0]))
+        z.append(float(quantile.max()))
+        bayes.append(float(field_log_bayes_factor(observed, mean, variance).max()))
+        replicates.append(null_p)
+    return FieldTests(
+        np.array(smallest), np.array(p_value), np.array(z), np.array(bayes), np.min(replicates, axis=0)
+    )
