@@ -1,0 +1,97 @@
+"""`dtprob withheld` from cases to a score, with a model of the user's own."""
+
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from dtprob.cli import main
+from tests.unit.test_cli import CASE, EFFECTS, MODEL
+
+
+@pytest.fixture(scope="module")
+def cases(tmp_path_factory):
+    """One case with the effect, one without, one that cannot be read."""
+    folder = tmp_path_factory.mktemp("withheld")
+    rng = np.random.default_rng(0)
+    x = np.linspace(-1, 1, 200)
+    for name, bias in (("0000", 0.5), ("0001", 0.0), ("0002", 0.0)):
+        own = folder / "cases" / name
+        own.mkdir(parents=True)
+        y = 2 * x + bias + 0.1 * rng.normal(size=200)
+        np.savetxt(own / "line.csv", np.column_stack([x, y]), delimiter=",", header="x,y", comments="")
+        (own / "line_model.py").write_text(MODEL)
+        (own / "line_effects.py").write_text(EFFECTS)
+        (own / "case.toml").write_text(CASE)
+    (folder / "cases" / "0002" / "line.csv").unlink()
+    key = {
+        "cases": [
+            {"name": "0000", "kind": "listed", "lambda": 100.0, "effects": [{"name": "bias"}]},
+            {"name": "0001", "kind": "null", "lambda": 100.0, "effects": []},
+            {"name": "0002", "kind": "null", "lambda": 100.0, "effects": []},
+        ]
+    }
+    (folder / "key.json").write_text(json.dumps(key))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def answered(cases):
+    status = main(
+        ["withheld", "run", str(cases / "cases"), "--out", str(cases / "answers"), "--workers", "2"]
+    )
+    assert status == 1  # one case cannot be read, which ends no other
+    return cases
+
+
+def test_answers_are_reports(answered):
+    verdicts = {}
+    for name in ("0000", "0001"):
+        report = json.loads((answered / "answers" / name / "report.json").read_text())
+        verdicts[name] = report["verdict"], [cause["effects"] for cause in report["causes"]]
+    assert verdicts == {"0000": ("LISTED", [["bias"]]), "0001": ("NO_GAP", [])}
+    assert "line.csv" in (answered / "answers" / "0002" / "error.txt").read_text()
+    assert not (answered / "answers" / "0002" / "report.json").exists()
+
+
+def test_the_score(answered, capsys):
+    status = main(["withheld", "score", str(answered / "answers"), "--key", str(answered / "key.json")])
+    assert status == 0
+    assert "right effect first: 1/1" in capsys.readouterr().out
+    score = json.loads((answered / "answers" / "score.json").read_text())
+    strata = {stratum["kind"]: stratum for stratum in score["strata"]}
+    assert strata["null"]["verdicts"] == {"FAILED": 1, "NO_GAP": 1}
+    assert (answered / "answers" / "score.html").stat().st_size > 2000
+
+
+def test_resume_keeps_answers(answered):
+    file = answered / "answers" / "0000" / "report.json"
+    before = file.stat().st_mtime_ns
+    shutil.rmtree(answered / "cases" / "0002")
+    assert (
+        main(["withheld", "run", str(answered / "cases"), "--out", str(answered / "answers"), "--resume"])
+        == 0
+    )
+    assert file.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (["run", "nowhere", "--out", "out"], "folders with a case.toml each"),
+        (["run", ".", "--out", "out", "--workers", "0"], "a worker or more"),
+        (["score", ".", "--key", "key.json"], "No such file"),
+        (["generate", "--track", "chanel", "--count", "1", "--out", "out"], "Did you mean 'channel'?"),
+        (["generate", "--track", "channel", "--count", "0", "--out", "out"], "a count from 1"),
+        (["genrate"], "Did you mean 'generate'?"),
+    ],
+)
+def test_wrong_input(words, text, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    try:
+        status = main(["withheld", *words])
+    except SystemExit as stop:
+        status = stop.code
+    assert status == 2
+    assert text in capsys.readouterr().err
