@@ -12,7 +12,8 @@ import numpy as np
 from dtprob.effects.effect import Effect, Parameter, with_effects
 from dtprob.gap import fit as fitting
 from dtprob.gap.diagnosis import Size
-from dtprob.gap.plausible import nulls, scales
+from dtprob.gap.informed import informed
+from dtprob.gap.plausible import nulls, scales, sides
 from dtprob.gap.problem import Problem
 from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.laplace import Laplace
@@ -56,12 +57,23 @@ def _posterior(
         position = {int(i): j for j, i in enumerate(fitted.global_index)}
         noise = np.asarray(jax.random.normal(key, (engine.draws, len(fitted.global_index))))
         moved = fitted.x[fitted.global_index] + noise @ np.linalg.cholesky(fitted.covariance).T
+        moved = np.maximum(moved, _lowest(problem, means, fitted))
         names = [e.site_name(p.name) for e in means for p in e.parameters]
         return {n: moved[:, [position[int(i)] for i in problem.layout[n].index[0]]] for n in names}
     started = _start_at(engine, problem.initial(fitted.x, means))
     only_draws = RunOptions(deterministics=False, pointwise=False)
-    posterior = started(key, with_effects(problem.model, means), problem.data, options=only_draws)
+    model = with_effects(informed(problem.model, problem.known), means)
+    posterior = started(key, model, problem.data, options=only_draws)
     return {name: np.asarray(draws) for name, draws in posterior.draws.items()}
+
+
+def _lowest(problem: Problem, means: Sequence[Effect], fitted: fitting.Fit) -> np.ndarray:
+    """The smallest value of each global coordinate: the null of one-sided parameters."""
+    lowest = np.full(problem.dimension, -np.inf)
+    for effect in means:
+        index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+        lowest[index] = np.where(sides(effect), nulls(effect), -np.inf)
+    return lowest[fitted.global_index]
 
 
 def _start_at(engine: AbstractEngine, initial: Mapping[str, Any]) -> AbstractEngine:

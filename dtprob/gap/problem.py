@@ -61,10 +61,10 @@ class Problem:
         self.arrays, self._static = split_static(data)
         self._check_effects()
         self._column = column
-        self._known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self.set_live(())
         if reference is not None:
-            self._known = normal_of(self._reference_draws(reference))
+            self.known = normal_of(self._reference_draws(reference))
             self.set_live(())
 
     def set_live(self, live: tuple[Effect, ...]) -> None:
@@ -84,7 +84,7 @@ class Problem:
             self.rows,
             shapes,
             families,
-            self._known,
+            self.known,
         )
 
     def with_live(self, names: Sequence[str]) -> Problem:

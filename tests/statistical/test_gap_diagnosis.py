@@ -20,7 +20,7 @@ from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fit import fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.inference import Laplace
+from dtprob.inference import NUTS, Laplace
 from dtprob.models.declaration import split_static
 from tests.unit.gap.examples import (
     SIGMA,
@@ -63,7 +63,8 @@ def shared_compilation():
             known[key] = make()
         problem = known[key]
         problem.data, problem.arrays = dict(data), split_static(data)[0]
-        problem.programs._arrays = problem.arrays
+        problem.programs._arrays = problem.compiled._arrays = problem.arrays
+        problem.__dict__.pop("observed_values", None)
         return problem
 
     def key_of(model, data, effects, cluster, live=()):
@@ -80,13 +81,9 @@ def shared_compilation():
     plain = Problem.with_live
 
     def with_live(self, names):
-        if (
-            self._reference is not None
-            or self._cluster in self.data
-            or set(names) <= {e.name for e in self.live}
-        ):
+        if self.known or self._column in self.data or set(names) <= {e.name for e in self.live}:
             return plain(self, names)
-        key = key_of(self.model, self.data, self.effects, self._cluster, names)
+        key = key_of(self.model, self.data, self.effects, self.declaration.cluster, names)
         return shared(key, lambda: plain(self, names), self.data)
 
     with pytest.MonkeyPatch.context() as patch:
@@ -214,6 +211,17 @@ def test_sizes_too_are_relative_to_earlier_data():
     sizes, _ = confirm(problem, fitted, problem.effects, jax.random.key(0), Laplace())
     assert sizes[0].low < 0.6 < sizes[0].high
     assert sizes[0].high - sizes[0].low < 0.4  # twice 1.64 standard deviations of 0.07, and room
+
+
+def test_another_engine_too_knows_the_earlier_data():
+    plain = Problem(line, draw("line", seed=41, shift=0.6), (raised(),), None, Earlier())
+    problem = plain.with_live(["raised"])
+    fitted = fit(problem, problem.null(), ["raised"])
+    ours, _ = confirm(problem, fitted, problem.effects, jax.random.key(0), Laplace())
+    nuts = NUTS(chains=2, warmup=200, draws=400)
+    theirs, _ = confirm(problem, fitted, problem.effects, jax.random.key(1), nuts)
+    width = ours[0].high - ours[0].low
+    np.testing.assert_allclose([theirs[0].low, theirs[0].high], [ours[0].low, ours[0].high], atol=0.2 * width)
 
 
 def test_sizes_come_from_the_engine():
