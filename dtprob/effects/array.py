@@ -20,7 +20,6 @@ from dtprob.effects.common import (
     Data,
     Family,
     Sites,
-    along,
     array_of,
     band,
     complex_of,
@@ -29,7 +28,6 @@ from dtprob.effects.common import (
     has_phase,
     n_antenna,
     normal,
-    observable_basis,
     offers,
     on_axis,
     phasor,
@@ -160,27 +158,6 @@ def element_spacing(sites: Sites, data: Data) -> list[Effect]:
     ]
 
 
-def antenna_orientation(sites: Sites, data: Data) -> list[Effect]:
-    """The array is turned; its elements' patterns and polarisation are taken to stay."""
-    effects = []
-    for side, array in _arrays(sites, data).items():
-        levers = np.cross(array[:, None], np.eye(3)[None]).reshape(-1, 3)
-        basis = observable_basis(levers)
-        effects.append(
-            _phase_effect(
-                "antenna_orientation",
-                side,
-                normal("rotation", 0.05, "rad", len(basis)),
-                lambda p, k, r, _, basis=basis: jnp.einsum(
-                    "...x,ax->...a", k, _turned(r, p["rotation"] @ jnp.asarray(basis))
-                ),
-                physics=f"The {side} array is turned about its centre, around {along(basis)}.",
-                source="r' = R r, R by Rodrigues from the vector 2 tan(angle / 2) times the axis.",
-            )
-        )
-    return effects
-
-
 def near_field(sites: Sites, data: Data) -> list[Effect]:
     """Wave fronts are spheres, not planes."""
 
@@ -265,19 +242,11 @@ def _phase_effect(
     )
 
 
-def _turned(positions: Float[Array, "antenna 3"], rotation: Float[Array, " 3"]) -> Float[Array, "antenna 3"]:
-    """R r - r for the rotation whose Rodrigues vector is rotation / 2; exactly 0 for no rotation."""
-    half = jnp.broadcast_to(rotation / 2, positions.shape)
-    first = jnp.cross(half, positions)
-    return 2 * (first + jnp.cross(half, first)) / (1.0 + jnp.sum(half**2, -1, keepdims=True))
-
-
 FAMILIES: Final[dict[str, Family]] = {
     "array_calibration": array_calibration,
     "cable_delay": cable_delay,
     "mutual_coupling": mutual_coupling,
     "element_spacing": element_spacing,
-    "antenna_orientation": antenna_orientation,
     "near_field": near_field,
     "angular_spread": angular_spread,
 }

@@ -15,6 +15,7 @@ from dtprob.effects import (
     motion,
     noise,
     nonlinearity,
+    orientation,
     surface,
     visibility,
 )
@@ -29,6 +30,7 @@ FAMILIES: Final[dict[str, Family]] = {
     **extra.FAMILIES,
     **loss.FAMILIES,
     **array.FAMILIES,
+    **orientation.FAMILIES,
     **front_end.FAMILIES,
     **nonlinearity.FAMILIES,
     **motion.FAMILIES,

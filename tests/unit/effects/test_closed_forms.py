@@ -1,5 +1,8 @@
 """Effects against results by hand, or against the same world built otherwise."""
 
+import dataclasses
+
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -8,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from dtprob.effects import Rewriting, catalogue
 from dtprob.raytracing.field import path_gain
+from dtprob.raytracing.pattern import field_vector
 
 SPEED = 299_792_458.0
 SHARED = {"path_phase": jnp.zeros((3, 1, 7)), "frequency_response": jnp.ones(17, complex)}
@@ -19,7 +23,7 @@ def apply(world):
 
     def run(name=None, data=None, **parameters):
         data = world.data if data is None else data
-        chosen = [] if name is None else list(catalogue(world.sites, world.data, [name]))[:1]
+        chosen = [] if name is None else list(catalogue(world.sites, data, [name]))[:1]
         given = {e.name: {k: jnp.asarray(v, float) for k, v in parameters.items()} for e in chosen}
         with (
             handlers.trace() as trace,
@@ -200,6 +204,29 @@ def test_array_geometry_agrees_with_other_positions(world, apply, side):
     found = apply(effect.name, rotation=given)
     assert np.allclose(found[f"{side}_response"], expected[f"{side}_response"])
     assert effect.dimension == {"rx": 3, "tx": 2}[side]  # nobody sees a line turn about itself
+
+
+@pytest.mark.parametrize("side", ["rx", "tx"])
+def test_elements_turn_with_their_array(world, apply, side):
+    """The gain is that of a path set whose elements were turned from the start, pattern and polarisation too."""
+    paths = world.data["paths"]
+    direction = -jnp.asarray(paths.arrival) if side == "rx" else jnp.asarray(paths.departure)
+
+    def fitted(orientation):
+        field = field_vector(direction, pattern="dipole", polarization="V", orientation=orientation)
+        told = (*paths.provenance, (f"{side}_pattern", "dipole"), (f"{side}_polarization", "V"))
+        changed = dataclasses.replace(paths, provenance=told)
+        return eqx.tree_at(lambda q: getattr(q, f"{side}_field"), changed, field)
+
+    level = {**world.data, "paths": fitted((0.0, 0.0, 0.0))}
+    effect = catalogue(world.sites, level, [f"antenna_orientation[{side}]"])[0]
+    angle = 2 * np.arctan(0.1)  # about z, the last of the axes that the array can see
+    given = np.zeros(effect.dimension)
+    given[-1] = 0.2
+    found = apply(effect.name, data=level, rotation=given)["path_gain"]
+    expected = apply(data={**world.data, "paths": fitted((angle, 0.0, 0.0))})["path_gain"]
+    assert np.allclose(found, expected, rtol=1e-9, atol=1e-12 * np.abs(expected).max())
+    assert "path_gain" not in catalogue(world.sites, world.data, [effect.name])[0].rewrites
 
 
 def test_near_field_is_the_sphere(world, apply):
