@@ -1,0 +1,94 @@
+"""What a declaration tells of a model."""
+
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.errors import InputError
+from dtprob.models.declaration import (
+    declare,
+    metadata,
+    model,
+    model_name,
+    select_arguments,
+    split_static,
+    trace_model,
+)
+
+DATA = {"x": jnp.arange(6.0).reshape(3, 2), "degree": 2, "y": jnp.zeros((3, 2))}
+
+
+def plain(x, degree, y=None):
+    """A model without metadata."""
+    level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+    angle = numpyro.sample("angle", dist.VonMises(0.0, 1.0))
+    with numpyro.plate("row", x.shape[0], dim=-2):
+        own = numpyro.sample("own", dist.Normal(level, 1.0))
+        mean = numpyro.deterministic("mean", own + jnp.cos(angle) * x**degree)
+        with numpyro.plate("column", x.shape[1], dim=-1):
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+@model(axes={"mean": ("row", "column")}, cluster="column")
+def marked(x, degree, y=None):
+    """The same with names."""
+    plain(x, degree, y)
+
+
+def test_sites_are_of_three_kinds():
+    found = declare(plain, DATA)
+    assert list(found.latent) == ["level", "angle", "own"]
+    assert list(found.deterministic) == ["mean"]
+    assert list(found.observed) == ["y"]
+    assert found.latent["angle"].is_circular
+    assert not found.latent["level"].is_circular
+    assert found.observed["y"].argument == "y"
+    assert found.observed["y"].distribution == "Normal"
+    assert found.sites["own"].shape == (3, 1)
+    assert found.sites["mean"].size == 6
+
+
+def test_the_first_plate_is_the_cluster_unless_one_is_named():
+    assert declare(plain, DATA).cluster == "row"
+    assert declare(marked, DATA).cluster == "column"
+    assert declare(marked, DATA, cluster="row").cluster == "row"
+
+
+def test_names_of_axes():
+    assert declare(plain, DATA).observed["y"].axes == ("row", "column")
+    assert declare(marked, DATA).sites["mean"].axes == ("row", "column")
+    assert metadata(functools.partial(marked, degree=1)).cluster == "column"
+    assert model_name(functools.partial(marked, degree=1)) == "marked"
+
+
+def test_arrays_and_settings_come_apart():
+    arrays, static = split_static(DATA)
+    assert {name for name, value in arrays.items() if value is not None} == {"x", "degree", "y"}
+    assert all(value is None for value in static.values())
+    _, words = split_static({**DATA, "phase": "coherent"})
+    assert words["phase"] == "coherent"
+
+
+def test_substituted_sites_have_their_values():
+    trace = trace_model(plain, DATA, jax.random.key(0), {"level": jnp.array(3.0)})
+    assert float(trace["level"]["value"]) == 3.0
+    assert trace["own"]["value"].shape == (3, 1)
+
+
+def test_wrong_arguments():
+    with pytest.raises(InputError, match="Did you mean 'degree'"):
+        select_arguments(plain, {**DATA, "degre": 2})
+    with pytest.raises(InputError, match="an entry 'degree'"):
+        select_arguments(plain, {"x": DATA["x"]})
+
+
+def test_a_model_without_an_observation():
+    def prior(x):
+        numpyro.sample("level", dist.Normal(jnp.sum(x), 1.0))
+
+    with pytest.raises(InputError, match="observed site"):
+        declare(prior, {"x": DATA["x"]})
