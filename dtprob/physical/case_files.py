@@ -60,10 +60,14 @@ def write_case(
     )
     write(folder / "channels.npz", data)
     with atomic_write(folder / "case.toml") as temporary:
-        temporary.write_text(_toml(nominal, model, phase, used, excluded, seed), encoding="utf-8")
+        temporary.write_text(
+            _toml(nominal, model, phase=phase, used=used, excluded=excluded, seed=seed), encoding="utf-8"
+        )
 
 
-def _toml(nominal: World, model: str, phase: str, used: Sequence[str], excluded: Sequence[str], seed: int) -> str:
+def _toml(
+    nominal: World, model: str, *, phase: str, used: Sequence[str], excluded: Sequence[str], seed: int
+) -> str:
     left_out = f"exclude = {json.dumps(list(excluded))}\n" if excluded else ""
     return f"""[model]
 name = "{model}"

@@ -79,7 +79,16 @@ def generate(folder: Path) -> None:
     truth = simulate(world, sounding, thermal(power), [(moved, MOVED)])
     channel = measure(rng, truth, sounding)
     recorded = float(power * np.exp(0.05 * rng.standard_normal()))
-    write_case(folder, paths, nominal, sounding, channel, noise_power=recorded, model="ray_traced_channel", used=EFFECTS)
+    write_case(
+        folder,
+        paths,
+        nominal,
+        sounding,
+        channel,
+        noise_power=recorded,
+        model="ray_traced_channel",
+        used=EFFECTS,
+    )
     error = np.sum(np.abs(truth.mean - clean.mean) ** 2) / np.sum(np.abs(truth.mean) ** 2)
     record = {
         "effect": moved.name,

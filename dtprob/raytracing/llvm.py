@@ -120,9 +120,11 @@ def works(library: Library) -> bool:
     """Whether Dr.Jit compiles and runs a kernel with this library, tried in a process of its own."""
     environment = {**os.environ, VARIABLE: str(library.path)}
     command = [sys.executable, "-c", _PROBE]
-    quiet = {"stdin": subprocess.DEVNULL, "stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
+    none = subprocess.DEVNULL
     try:
-        done = subprocess.run(command, env=environment, timeout=120, check=False, **quiet)  # noqa: S603 (our own text)
+        done = subprocess.run(  # noqa: S603 (our own text)
+            command, env=environment, timeout=120, check=False, stdin=none, stdout=none, stderr=none
+        )
     except subprocess.TimeoutExpired:
         return False
     return done.returncode == 0

@@ -24,7 +24,9 @@ def few_links(prepared):
 
 @pytest.mark.parametrize("model", [ray_traced_channel, phase_error_channel])
 def test_channel_models(model, few_links):
-    data = {name: value for name, value in few_links.items() if model is ray_traced_channel or name != "phase"}
+    data = {
+        name: value for name, value in few_links.items() if model is ray_traced_channel or name != "phase"
+    }
     check_model(model, data)
 
 

@@ -24,7 +24,9 @@ def test_fields_are_transverse(pattern, polarization):
     assert np.max(np.abs(np.sum(field * k, axis=-1))) < 1e-12
 
 
-@pytest.mark.parametrize(("pattern", "radiated"), [("iso", 1.0), ("dipole", 1.0), ("hw_dipole", 1.643 / 1.640922)])
+@pytest.mark.parametrize(
+    ("pattern", "radiated"), [("iso", 1.0), ("dipole", 1.0), ("hw_dipole", 1.643 / 1.640922)]
+)
 def test_antennas_radiate_what_they_are_fed(pattern, radiated):
     z, weight = np.polynomial.legendre.leggauss(200)
     k = np.stack([np.sqrt(1 - z**2), np.zeros_like(z), z], axis=-1)

@@ -194,9 +194,7 @@ def test_a_link_without_paths(street):
 
 
 def test_line_of_sight_alone(street):
-    paths = trace(
-        street, np.array([[0.0, 0.0, 2.0]]), np.array([[3.0, 4.0, 2.0]]), max_depth=0, samples=1
-    )
+    paths = trace(street, np.array([[0.0, 0.0, 2.0]]), np.array([[3.0, 4.0, 2.0]]), max_depth=0, samples=1)
     assert (paths.n_path, paths.depth) == (1, 1)
     assert float(paths.length[0, 0]) == pytest.approx(5.0, rel=1e-14)
     assert complex(path_gain(paths, paths.permittivity, paths.conductivity)[0, 0]) == pytest.approx(
