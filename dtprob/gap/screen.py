@@ -17,10 +17,12 @@ from scipy import stats
 
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
+from dtprob.gap.active import activate
 from dtprob.gap.directions import Tangents, surroundings, tangents
 from dtprob.gap.fields import field_tests
 from dtprob.gap.plausible import log_bayes_factor, scales
 from dtprob.gap.problem import Problem
+from dtprob.gap.projection import Projection
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import (
     LOG_SMALLEST,
@@ -64,62 +66,11 @@ class Screening:
 
 
 @dataclass(frozen=True)
-class Projection:
-    """Whitened tangents of the fitted nuisances, and what removes them from rows and from columns."""
-
-    columns: jax.Array
-    local_columns: jax.Array
-    local_inverse: jax.Array
-    global_inverse: jax.Array
-    reduced: jax.Array
-
-    def rows(self, e: jax.Array) -> jax.Array:
-        """Rows (..., cluster, row) after the linearised refit of all nuisances."""
-        score = jnp.einsum("cmg,...cm->...g", self.reduced, e)
-        e = e - jnp.einsum("cmg,gh,...h->...cm", self.columns, self.global_inverse, score)
-        local = jnp.einsum("cml,...cm->...cl", self.local_columns, e)
-        return e - jnp.einsum("cml,clk,...ck->...cm", self.local_columns, self.local_inverse, local)
-
-    def adjust(self, w: jax.Array) -> tuple[jax.Array, jax.Array]:
-        """Effect columns (cluster, row, k) after projection, and B's part that falls on the global nuisances."""
-        local = jnp.einsum("cml,cmk->clk", self.local_columns, w)
-        w = w - jnp.einsum("cml,cli,cik->cmk", self.local_columns, self.local_inverse, local)
-        cross = jnp.einsum("cmg,cmk->gk", self.reduced, w)
-        coefficients = self.global_inverse @ cross
-        return w - jnp.einsum("cmg,gk->cmk", self.reduced, coefficients), coefficients
-
-
-def project(problem: Problem, fitted: fitting.Fit) -> Projection:
-    """Projection on the complement of everything that the fit is free to move."""
-    active = fitting.activate(problem, fitted.effects)
-    directions = fitting.basis(problem, active)
-    n = len(active.global_index)
-    w = problem.compiled.columns(fitted.x, directions)
-    hessian = np.asarray(problem.compiled.prior_curvature(fitted.x, directions))
-    _, _, effect_curvature = fitting.effect_prior(
-        problem, fitting.Active(active.blocks, active.effects, active.weights, fitted.spread), fitted.x
-    )
-    w_global, w_local = w[..., :n], w[..., n:]
-    local = np.asarray(jnp.einsum("cmi,cmj->cij", w_local, w_local))
-    local = local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
-    for j in range(active.local_index.shape[1]):
-        local[:, j, j] += effect_curvature[active.local_index[:, j]]
-    local_inverse = jnp.asarray(np.linalg.inv(fitting.positive(local)) if local.shape[-1] else local)
-    cross = jnp.einsum("cml,cmg->clg", w_local, w_global)
-    reduced = w_global - jnp.einsum("cml,cli,cig->cmg", w_local, local_inverse, cross)
-    curvature = np.asarray(jnp.einsum("cmi,cmj->ij", w_global, reduced))
-    curvature = (
-        curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
-    )
-    inverse = np.linalg.inv(fitting.positive(curvature)) if n else curvature
-    return Projection(w_global, w_local, local_inverse, jnp.asarray(inverse), reduced)
-
-
-@dataclass(frozen=True)
 class Replicates:
     """Data sets drawn at a fit, the nuisances refitted to first order, and what they say at the sites.
 
     Attributes:
+        raw: rows of the data (cluster, row), as if nothing had been fitted.
         observed: projected rows of the data (cluster, row).
         rows: whitened rows of the replicates (replicate, cluster, row), not projected.
         values: observed values of the replicates by site.
@@ -127,6 +78,7 @@ class Replicates:
         projected: projected rows of those first replicates.
     """
 
+    raw: jax.Array
     observed: jax.Array
     rows: jax.Array
     values: Mapping[str, jax.Array]
@@ -139,10 +91,12 @@ def replicate(
 ) -> Replicates:
     """Draw the bootstrap that the screening and the maps share."""
     rows, values = problem.compiled.replicate(fitted.x, jax.random.split(key, settings.replicates))
-    observed = projection.rows(problem.compiled.residual(fitted.x)[None])[0]
+    rows = projection.with_prior(rows, jax.random.fold_in(key, 1))
+    raw = projection.before_fit(problem.compiled.residual(fitted.x))
+    observed = projection.rows(raw[None])[0]
     projected = projection.rows(rows[: settings.site_replicates])
     gradients = problem.compiled.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
-    return Replicates(observed, rows, values, gradients, projected)
+    return Replicates(raw, observed, rows, values, gradients, projected)
 
 
 def screen(
@@ -153,7 +107,7 @@ def screen(
     means = [e for e in candidates if e.kind == "mean"]
     fields = [e for e in candidates if e.kind == "variance"]
     around = surroundings(problem, fitted.x)
-    scores = _mean_scores(problem, fitted, projection, drawn, tangents(around, means, problem.programs))
+    scores = _mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
     energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
     tested = field_tests(energy, [e.name for e in fields], len(drawn.projected))
     mean_p, mean_z = _mean_tests(scores, scores.u[None])
@@ -227,13 +181,11 @@ def _is_one_sided(effect: Effect) -> bool:
     return effect.dimension == 1 and effect.parameters[0].is_one_sided
 
 
-def _mean_scores(
-    problem: Problem, fitted: fitting.Fit, projection: Projection, drawn: Replicates, found: Tangents
-) -> _Scores:
+def _mean_scores(problem: Problem, projection: Projection, drawn: Replicates, found: Tangents) -> _Scores:
     adjusted, coefficients = projection.adjust(found.columns)
     information = np.array(jnp.einsum("cmi,cmj->ij", found.columns, adjusted))
     total = np.array(jnp.einsum("cmi,cmi->i", found.columns, found.columns))
-    u = np.array(jnp.einsum("cmk,cm->k", adjusted, problem.compiled.residual(fitted.x)))
+    u = np.array(jnp.einsum("cmk,cm->k", adjusted, drawn.raw))
     u_null = np.array(jnp.einsum("cmk,rcm->rk", adjusted, drawn.rows))
     values = problem.observed_values
     for effect, group in zip(found.effects, found.groups, strict=True):
@@ -278,7 +230,7 @@ def _absorbed(problem: Problem, fitted: fitting.Fit, scores: _Scores, effect: Ef
     left = own / np.maximum(scores.total[group], 1e-300)
     if left.max() > 1 - _ABSORBED or (own * scales(scores.effects[k]) ** 2).max() > _SEEN:
         return None
-    blocks = [b for b in fitting.activate(problem, fitted.effects).blocks if not b.local]
+    blocks = [b for b in activate(problem, fitted.effects).blocks if not b.local]
     owners = np.concatenate([[i] * b.size for i, b in enumerate(blocks)]) if blocks else np.zeros(0, int)
     if not len(owners):
         return "the clusters' own parameters"

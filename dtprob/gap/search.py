@@ -15,9 +15,10 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
+from dtprob.gap.projection import Projection, project
 from dtprob.gap.refit import polished, refit, starting_points
 from dtprob.gap.scan import Found, scan
-from dtprob.gap.screen import Projection, Screening, project, replicate, screen
+from dtprob.gap.screen import Screening, replicate, screen
 from dtprob.gap.settings import Settings
 from dtprob.gap.where import Location, locate
 

@@ -18,7 +18,8 @@ import numpy as np
 from dtprob.gap.curves import curves
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
-from dtprob.gap.screen import Projection, Replicates
+from dtprob.gap.projection import Projection
+from dtprob.gap.screen import Replicates
 from dtprob.gap.tails import family_wise, gamma_tail
 
 _CHANCE = 8
@@ -72,7 +73,8 @@ class Location:
 
 def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> Location:
     """Test every site family and every block of coordinates at a fit."""
-    values = {n: np.asarray(v) for n, v in problem.compiled.sites(fitted.x).items() if n in drawn.gradients}
+    at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
+    values = {n: np.asarray(v) for n, v in at.items() if n in drawn.gradients}
     scores = _scores(problem, drawn.gradients, values)
     names = list(scores)
     tests = [_family_test(scores[name][0], scores[name][1:]) for name in names]

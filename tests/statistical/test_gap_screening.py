@@ -4,13 +4,17 @@ import jax
 import numpy as np
 import pytest
 from scipy import stats
+from scipy.special import logsumexp
 
 from dtprob.gap import fit as fitting
+from dtprob.gap.plausible import SCALES
 from dtprob.gap.problem import Problem
-from dtprob.gap.screen import project, replicate, screen
+from dtprob.gap.projection import project
+from dtprob.gap.screen import replicate, screen
 from dtprob.gap.search import view
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise, gamma_tail
+from dtprob.gap.where import locate
 from dtprob.models.declaration import split_static
 from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation
 
@@ -22,7 +26,8 @@ def use(problem, data):
     """Put other data of the same shapes into a compiled problem."""
     problem.data = dict(data)
     problem.arrays = split_static(data)[0]
-    problem.programs._arrays = problem.arrays
+    problem.programs._arrays = problem.compiled._arrays = problem.arrays
+    problem.__dict__.pop("observed_values", None)
     return problem
 
 
@@ -72,9 +77,8 @@ def test_scores_are_those_of_neymans_test(problem):
         if name == "bend":  # prior N(0, 1): exact here, since all is Gaussian
             u, j = (left @ w) @ e, w @ left @ w
             np.testing.assert_allclose(found.step[name], [u / (j + 1)], rtol=1e-6)
-            np.testing.assert_allclose(
-                found.log_bayes_factor[k], -0.5 * np.log1p(j) + 0.5 * u**2 / (j + 1), rtol=1e-6
-            )
+            expected = logsumexp(0.5 * (SCALES**2 * u**2 / (SCALES**2 * j + 1) - np.log1p(SCALES**2 * j)))
+            np.testing.assert_allclose(found.log_bayes_factor[k], expected - np.log(len(SCALES)), rtol=1e-6)
     k = found.names.index("pair")
     w = np.stack([x.ravel() ** 3 / 3, np.cos(2 * x.ravel())], axis=1) / SIGMA
     u, j = (left @ w).T @ e, w.T @ left @ w
@@ -105,6 +109,7 @@ def test_a_variance_effect_follows_its_quadratic_form(problem):
     energy = problem.programs.field_energy(
         {n: np.asarray(v) for n, v in problem.compiled.sites(fitted.x).items()}, drawn.gradients
     )["jitter"]
+    energy = energy[:, 0]
     null = energy[1:]
     assert abs(null.mean() - mean) < 5 * np.sqrt(variance / len(null))
     assert abs(null.var() / variance - 1) < 0.35
@@ -157,3 +162,36 @@ def test_false_alarms_and_power_over_many_data_sets(problem):
         # An exact test would lie within; one that hardly ever speaks is no test.
         assert stats.binom.ppf(1e-3, n, level / 2) <= alarms <= stats.binom.ppf(0.999, n, level)
     assert first.count("bend") >= strong - 1
+
+
+@pytest.fixture(scope="module")
+def beside_a_field():
+    """Scores and site tests of 150 data sets with a random level of each link, at fits that know of it."""
+    problem = Problem(line, draw("line"), EFFECTS).with_live(["jitter"])
+    settings = Settings(replicates=99, site_replicates=99)
+    z, site = [], []
+    for seed in range(150):
+        level = 0.5 * SIGMA * np.random.default_rng(seed).normal(size=(12, 1))
+        use(problem, draw("line", seed=1000 + seed, shift=level))
+        fitted = fitting.fit(problem, problem.null(), ["jitter"], spread=0.5 * SIGMA)
+        projection = project(problem, fitted)
+        drawn = replicate(problem, fitted, projection, jax.random.key(seed), settings)
+        found = screen(problem, fitted, projection, drawn, settings)
+        z.append(found.z[[found.names.index(n) for n in ("bend", "ripple")]])
+        site.append(locate(problem, fitted, projection, drawn).site_p_value)
+    return np.array(z), np.array(site)
+
+
+def test_scores_beside_a_random_field_are_standard_normal(beside_a_field):
+    """Mean and variance within a chance of 1 in 1,000, estimating the field's size apart."""
+    z, _ = beside_a_field
+    n = len(z)
+    assert np.all(np.abs(z.mean(axis=0)) < 4 / np.sqrt(n))
+    low, high = stats.chi2.ppf([5e-4, 1 - 5e-4], n - 1) / (n - 1)
+    assert np.all(z.var(axis=0, ddof=1) > 0.85 * low)
+    assert np.all(z.var(axis=0, ddof=1) < 1.15 * high)
+
+
+def test_sites_beside_a_random_field_raise_no_alarm(beside_a_field):
+    _, p = beside_a_field
+    assert np.sum(p <= 0.05) <= stats.binom.ppf(0.999, len(p), 0.07)
