@@ -22,6 +22,7 @@ from dtprob.models.scene import (
     array_response,
     channel_shape,
     observe,
+    site,
     unknown_materials,
     unknown_noise_power,
     unknown_phase,
@@ -37,6 +38,7 @@ type Phase = Literal["coherent", "per_packet"]
 def ray_traced_channel(
     paths: PathSet,
     subcarrier_frequency: Float[Array, " subcarrier"],
+    *,
     rx_array: Float[Array, "rx_antenna 3"] | None = None,
     tx_array: Float[Array, "tx_antenna 3"] | None = None,
     noise_power: Any = None,
@@ -64,20 +66,27 @@ def ray_traced_channel(
     Returns:
         The noiseless channel.
     """
-    shape = channel_shape(paths, subcarrier_frequency, rx_array, tx_array, snapshot_time, channel)
+    shape = channel_shape(
+        paths,
+        subcarrier_frequency,
+        rx_array=rx_array,
+        tx_array=tx_array,
+        snapshot_time=snapshot_time,
+        channel=channel,
+    )
     error = jnp.zeros((1, 1, 1))
     return _channel(
         paths,
         subcarrier_frequency,
-        rx_array,
-        tx_array,
-        noise_power,
-        phase,
-        materials,
-        law,
-        channel,
-        shape,
-        error,
+        rx_array=rx_array,
+        tx_array=tx_array,
+        noise_power=noise_power,
+        phase=phase,
+        materials=materials,
+        law=law,
+        channel=channel,
+        shape=shape,
+        phase_error=error,
     )
 
 
@@ -85,6 +94,7 @@ def ray_traced_channel(
 def phase_error_channel(
     paths: PathSet,
     subcarrier_frequency: Float[Array, " subcarrier"],
+    *,
     rx_array: Float[Array, "rx_antenna 3"] | None = None,
     tx_array: Float[Array, "tx_antenna 3"] | None = None,
     noise_power: Any = None,
@@ -98,7 +108,14 @@ def phase_error_channel(
     z_p ~ VM(0, k0), k0 unknown; the other arguments are those of `ray_traced_channel`. Source: Ruah et al.,
     arXiv 2312.12625, eq. of the phase error channel model.
     """
-    shape = channel_shape(paths, subcarrier_frequency, rx_array, tx_array, snapshot_time, channel)
+    shape = channel_shape(
+        paths,
+        subcarrier_frequency,
+        rx_array=rx_array,
+        tx_array=tx_array,
+        snapshot_time=snapshot_time,
+        channel=channel,
+    )
     concentration = numpyro.sample("phase_concentration", dist.LogNormal(0.0, 1.5))
     with (
         numpyro.plate("link", shape[0], dim=-3),
@@ -109,21 +126,22 @@ def phase_error_channel(
     return _channel(
         paths,
         subcarrier_frequency,
-        rx_array,
-        tx_array,
-        noise_power,
-        "coherent",
-        materials,
-        law,
-        channel,
-        shape,
-        error,
+        rx_array=rx_array,
+        tx_array=tx_array,
+        noise_power=noise_power,
+        phase="coherent",
+        materials=materials,
+        law=law,
+        channel=channel,
+        shape=shape,
+        phase_error=error,
     )
 
 
 def _channel(
     paths: PathSet,
     subcarrier_frequency: jax.Array,
+    *,
     rx_array: jax.Array | None,
     tx_array: jax.Array | None,
     noise_power: Any,
@@ -135,28 +153,21 @@ def _channel(
     phase_error: Any,
 ) -> jax.Array:
     permittivity, conductivity = unknown_materials(paths, materials)
-    permittivity = numpyro.deterministic("permittivity", permittivity)
-    conductivity = numpyro.deterministic("conductivity", conductivity)
-    gain = numpyro.deterministic("path_gain", field.path_gain(paths, permittivity, conductivity, law=law))
-    delay = numpyro.deterministic("path_delay", paths.delay)
-    departure = numpyro.deterministic("departure", paths.departure)
-    arrival = numpyro.deterministic("arrival", paths.arrival)
-    path_phase = numpyro.deterministic("path_phase", phase_error + _packet_phase(phase, shape))
-    tx_response = numpyro.deterministic(
-        "tx_response", array_response(tx_array, departure, paths.frequency, 1.0)
-    )
-    rx_response = numpyro.deterministic(
-        "rx_response", array_response(rx_array, arrival, paths.frequency, -1.0)
-    )
-    frequency_response = numpyro.deterministic(
-        "frequency_response", jnp.ones(shape[4], jnp.result_type(gain))
-    )
+    permittivity = site("permittivity", permittivity)
+    conductivity = site("conductivity", conductivity)
+    gain = site("path_gain", field.path_gain(paths, permittivity, conductivity, law=law))
+    delay = site("path_delay", paths.delay)
+    departure = site("departure", paths.departure)
+    arrival = site("arrival", paths.arrival)
+    path_phase = site("path_phase", phase_error + _packet_phase(phase, shape))
+    tx_response = site("tx_response", array_response(tx_array, departure, paths.frequency, 1.0))
+    rx_response = site("rx_response", array_response(rx_array, arrival, paths.frequency, -1.0))
+    frequency_response = site("frequency_response", jnp.ones(shape[4], jnp.result_type(gain)))
     response = field.frequency_response(paths, subcarrier_frequency, delay) * frequency_response
     phasor = jax.lax.complex(jnp.cos(path_phase), jnp.sin(path_phase))
-    noiseless = numpyro.deterministic(
-        "noiseless_channel", field.synthesize(gain, response, rx_response, tx_response, phasor)
-    )
-    noise = numpyro.deterministic("noise_power", unknown_noise_power(noise_power, paths))
+    noiseless = field.synthesize(gain, response, rx_response, tx_response, phasor)
+    noiseless = site("noiseless_channel", noiseless)
+    noise = site("noise_power", unknown_noise_power(noise_power, paths))
     observe(noiseless, noise, shape, channel)
     return noiseless
 
@@ -166,4 +177,4 @@ def _packet_phase(phase: Phase, shape: tuple[int, int, int, int, int]) -> Any:
     if phase == "coherent":
         return jnp.zeros((1, 1, 1))
     with numpyro.plate("link", shape[0], dim=-2), numpyro.plate("snapshot", shape[1], dim=-1):
-        return numpyro.sample("packet_phase", unknown_phase())[..., None]
+        return jnp.asarray(numpyro.sample("packet_phase", unknown_phase()))[..., None]

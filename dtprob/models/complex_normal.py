@@ -23,7 +23,7 @@ class ComplexNormal(Distribution):
     """
 
     arg_constraints = {"loc": constraints.complex, "variance": constraints.positive}  # noqa: RUF012
-    support = constraints.complex
+    support = constraints.complex  # pyright: ignore[reportAssignmentType, reportIncompatibleMethodOverride]
     reparametrized_params = ["loc", "variance"]  # noqa: RUF012
     pytree_data_fields = ("loc", "_variance")
 
@@ -32,8 +32,8 @@ class ComplexNormal(Distribution):
         shape = lax.broadcast_shapes(jnp.shape(loc), jnp.shape(variance))
         super().__init__(batch_shape=shape, validate_args=validate_args)
 
-    def sample(self, key: jax.Array, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        """Draws of shape sample_shape + batch_shape."""
+    def sample(self, key: jax.Array | None, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+        """Draws of shape sample_shape + batch_shape; the key is needed."""
         dtype = jnp.result_type(self.loc, jnp.complex64)
         noise = jax.random.normal(key, sample_shape + self.batch_shape, dtype)
         return self.loc + jnp.sqrt(self.variance) * noise

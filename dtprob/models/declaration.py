@@ -103,7 +103,7 @@ class Declaration:
 def base_constraint(support: constraints.Constraint | None) -> constraints.Constraint | None:
     """The constraint of a single entry, without the wrappers of independent dimensions."""
     while support is not None and hasattr(support, "base_constraint"):
-        support = cast("constraints.Constraint", support.base_constraint)  # pyright: ignore
+        support = cast("constraints.Constraint", getattr(support, "base_constraint"))  # noqa: B009
     return support
 
 
@@ -157,17 +157,14 @@ def select_arguments(function: Model, data: Data) -> dict[str, Any]:
                 f"Did you mean {hint!r}?" if hint else "Remove it, or add the argument to the model.",
             )
     for name, parameter in parameters.items():
-        if parameter.default is parameter.empty and parameter.kind not in (
-            parameter.VAR_KEYWORD,
-            parameter.VAR_POSITIONAL,
-        ):
-            if name not in data:
-                raise InputError(
-                    f"data for {model_name(function)}",
-                    f"an entry {name!r}",
-                    ", ".join(data) or "nothing",
-                    f"Give {name!r}, or a default in the model.",
-                )
+        is_variadic = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+        if parameter.default is parameter.empty and not is_variadic and name not in data:
+            raise InputError(
+                f"data for {model_name(function)}",
+                f"an entry {name!r}",
+                ", ".join(data) or "nothing",
+                f"Give {name!r}, or a default in the model.",
+            )
     return dict(data)
 
 

@@ -39,10 +39,11 @@ AXES = {
 def channel_shape(
     paths: PathSet,
     subcarrier_frequency: jax.Array,
-    rx_array: jax.Array | None,
-    tx_array: jax.Array | None,
-    snapshot_time: jax.Array | None,
-    channel: jax.Array | None,
+    *,
+    rx_array: jax.Array | None = None,
+    tx_array: jax.Array | None = None,
+    snapshot_time: jax.Array | None = None,
+    channel: jax.Array | None = None,
 ) -> tuple[int, int, int, int, int]:
     """(link, snapshot, rx_antenna, tx_antenna, subcarrier), checked against the measurement's shape."""
     expected = (
@@ -96,6 +97,11 @@ def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, 
 def unknown_phase() -> dist.VonMises:
     """An angle of which nothing is known: uniform to 1e-9, and it can be sampled."""
     return dist.VonMises(0.0, 1e-9)
+
+
+def site(name: str, value: jax.Array) -> jax.Array:
+    """A named intermediate, on which effects act."""
+    return jnp.asarray(numpyro.deterministic(name, value))
 
 
 def array_response(array: jax.Array | None, direction: jax.Array, frequency: float, sign: float) -> jax.Array:

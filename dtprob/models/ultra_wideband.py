@@ -27,6 +27,7 @@ from dtprob.models.scene import (
     array_response,
     channel_shape,
     observe,
+    site,
     unknown_materials,
     unknown_noise_power,
     unknown_phase,
@@ -68,6 +69,7 @@ class _Receiver(NamedTuple):
 def ultra_wideband_channel(
     paths: PathSet,
     subcarrier_frequency: Float[Array, " subcarrier"],
+    *,
     noise_power: Any = None,
     rough_delay: Float[Array, " link"] | None = None,
     link_power: Float[Array, " link"] | None = None,
@@ -105,13 +107,11 @@ def ultra_wideband_channel(
     """
     if phase != "per_packet":
         raise InputError("phase", "per_packet", repr(phase), 'Set phase = "per_packet" in [data]')
-    shape = channel_shape(paths, subcarrier_frequency, None, None, None, channel)
+    shape = channel_shape(paths, subcarrier_frequency, channel=channel)
     room = _room(paths, materials, law)
     receiver = _receiver(shape[0], rough_delay)
     noiseless = _received(paths, subcarrier_frequency, room, receiver)
-    noise: Any = numpyro.deterministic(
-        "noise_power", _variance(paths, noise_power, link_power, model_error, shape[1])
-    )
+    noise = site("noise_power", _variance(paths, noise_power, link_power, model_error, shape[1]))
     observe(noiseless, noise, shape, channel)
     return noiseless
 
@@ -159,12 +159,11 @@ def _variance(
 def _room(paths: PathSet, materials: Materials, law: Law) -> jax.Array:
     """Gain of every path, (link, path)."""
     permittivity, conductivity = unknown_materials(paths, materials)
-    eps: Any = numpyro.deterministic("permittivity", permittivity)
-    sigma: Any = numpyro.deterministic("conductivity", conductivity)
-    thickness: Any = numpyro.deterministic("thickness", jnp.asarray(paths.thickness))
+    eps = site("permittivity", permittivity)
+    sigma = site("conductivity", conductivity)
+    thickness = site("thickness", jnp.asarray(paths.thickness))
     gain = field.path_gain(paths, eps, sigma, thickness=thickness, law=law)
-    found: Any = numpyro.deterministic("path_gain", gain)
-    return found
+    return site("path_gain", gain)
 
 
 def _receiver(links: int, rough: jax.Array | None) -> _Receiver:
@@ -207,28 +206,21 @@ def _received(
     paths: PathSet, subcarrier_frequency: jax.Array, gain: jax.Array, receiver: _Receiver
 ) -> jax.Array:
     """The site `noiseless_channel` and those that lead to it from the gains of the paths."""
-    delay: Any = numpyro.deterministic("path_delay", paths.delay)
-    departure: Any = numpyro.deterministic("departure", paths.departure)
-    arrival: Any = numpyro.deterministic("arrival", paths.arrival)
+    delay = site("path_delay", paths.delay)
+    departure = site("departure", paths.departure)
+    arrival = site("arrival", paths.arrival)
     turned = jnp.broadcast_to(receiver.phase[:, None, None], (gain.shape[0], 1, gain.shape[1]))
-    path_phase: Any = numpyro.deterministic("path_phase", turned)
-    tx_response: Any = numpyro.deterministic(
-        "tx_response", array_response(None, departure, paths.frequency, 1.0)
-    )
-    rx_response: Any = numpyro.deterministic(
-        "rx_response", array_response(None, arrival, paths.frequency, -1.0)
-    )
-    common: Any = numpyro.deterministic("frequency_response", _pulse(subcarrier_frequency))
+    path_phase = site("path_phase", turned)
+    tx_response = site("tx_response", array_response(None, departure, paths.frequency, 1.0))
+    rx_response = site("rx_response", array_response(None, arrival, paths.frequency, -1.0))
+    common = site("frequency_response", _pulse(subcarrier_frequency))
     response = field.frequency_response(paths, subcarrier_frequency, delay)
     traced = field.synthesize(gain, response, rx_response, tx_response, _turn(path_phase))
     level = jnp.mean(jnp.real(traced) ** 2 + jnp.imag(traced) ** 2, axis=(1, 2, 3, 4))
-    amplitude: Any = numpyro.deterministic("receiver_gain", _gain_law(level, receiver))
-    late: Any = numpyro.deterministic("receiver_delay", receiver.delay)
+    amplitude = site("receiver_gain", _gain_law(level, receiver))
+    late = site("receiver_delay", receiver.delay)
     own = amplitude[:, None] * phasor(-late[:, None] * subcarrier_frequency)
-    noiseless: Any = numpyro.deterministic(
-        "noiseless_channel", traced * (own * common)[:, None, None, None, :]
-    )
-    return noiseless
+    return site("noiseless_channel", traced * (own * common)[:, None, None, None, :])
 
 
 def _gain_law(level: jax.Array, receiver: _Receiver) -> jax.Array:

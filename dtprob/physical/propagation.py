@@ -34,7 +34,8 @@ def phase_error(draw: Float[np.ndarray, "link instant path"], limit: float = 1.0
         each = np.repeat(each, count, axis=1) if each.shape[1] == 1 else each
         return each.reshape(-1, each.shape[2], int(np.prod(each.shape[3:])))
 
-    return Impairment("phase_error", "rad", limit, rays=turn, spread=spread)
+    instance = None if draw.shape[1] == 1 else "each_packet"
+    return Impairment("phase_error", "rad", limit, instance=instance, rays=turn, spread=spread)
 
 
 def doppler(velocity: Float[np.ndarray, "3"], limit: float = 100.0) -> Impairment:
