@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -28,6 +28,8 @@ class ComplexNormal(Distribution):
     pytree_data_fields = ("loc", "_variance")
 
     def __init__(self, loc: Any, variance: Any, *, validate_args: bool | None = None) -> None:
+        self.loc: Any
+        self._variance: Any
         self.loc, self._variance = promote_shapes(loc, variance)
         shape = lax.broadcast_shapes(jnp.shape(loc), jnp.shape(variance))
         super().__init__(batch_shape=shape, validate_args=validate_args)
@@ -35,10 +37,10 @@ class ComplexNormal(Distribution):
     def sample(self, key: jax.Array | None, sample_shape: tuple[int, ...] = ()) -> jax.Array:
         """Draws of shape sample_shape + batch_shape; the key is needed."""
         dtype = jnp.result_type(self.loc, jnp.complex64)
-        noise = jax.random.normal(key, sample_shape + self.batch_shape, dtype)
+        noise = jax.random.normal(cast("jax.Array", key), sample_shape + self.batch_shape, dtype)
         return self.loc + jnp.sqrt(self.variance) * noise
 
-    def log_prob(self, value: Any) -> jax.Array:
+    def log_prob(self, value: Any) -> jax.Array:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Log density per entry, in nats."""
         residual = value - self.loc
         square = jnp.real(residual) ** 2 + jnp.imag(residual) ** 2

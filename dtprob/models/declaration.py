@@ -57,7 +57,7 @@ class Site:
     axes: tuple[str, ...]
     plates: tuple[str, ...]
     is_complex: bool = False
-    support: constraints.Constraint | None = None
+    support: constraints.Constraint[Any] | None = None
     distribution: str | None = None
     argument: str | None = None
 
@@ -100,10 +100,10 @@ class Declaration:
         return self.of_kind("observed")
 
 
-def base_constraint(support: constraints.Constraint | None) -> constraints.Constraint | None:
+def base_constraint(support: constraints.Constraint[Any] | None) -> constraints.Constraint[Any] | None:
     """The constraint of a single entry, without the wrappers of independent dimensions."""
     while support is not None and hasattr(support, "base_constraint"):
-        support = cast("constraints.Constraint", getattr(support, "base_constraint"))  # noqa: B009
+        support = cast("constraints.Constraint[Any]", getattr(support, "base_constraint"))  # noqa: B009
     return support
 
 
