@@ -36,8 +36,8 @@ from dtprob.effects.effect import FIELD, Effect, Parameter
 
 _SIGN: Final = {"rx": -1.0, "tx": 1.0}
 _DIRECTION: Final = {"rx": "arrival", "tx": "departure"}
-_NEIGHBOUR: Final = 1.05
-"""Elements count as neighbours up to this multiple of the smallest distance."""
+_NEIGHBOUR: Final = 1.5
+"""Elements count as neighbours up to this multiple of the smallest distance, so those across a square do."""
 
 
 def array_calibration(sites: Sites, _data: Data) -> list[Effect]:
@@ -116,31 +116,44 @@ def cable_delay(sites: Sites, data: Data) -> list[Effect]:
 
 
 def mutual_coupling(sites: Sites, data: Data) -> list[Effect]:
-    """Every element picks up a share of what its nearest neighbours see."""
+    """Every element picks up a share of what its neighbours see, one share for each way to a neighbour."""
     effects = []
     for side, _ in _ends(sites):
         array = array_of(data, side)
         if array is None:
             continue
-        distance = np.linalg.norm(array[:, None] - array[None], axis=-1)
-        nearest = distance[~np.eye(len(array), dtype=bool)].min()
-        neighbours = np.where((distance > 0) & (distance <= _NEIGHBOUR * nearest), 1.0, 0.0)
+        neighbours = _neighbours(array)
 
-        def couple(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], matrix: Any = neighbours) -> Any:
-            return value + complex_of(p["coupling"]) * jnp.einsum("...a,ba->...b", value, jnp.asarray(matrix))
+        def couple(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], masks: Any = neighbours) -> Any:
+            shares = complex_of(p["coupling"].reshape(-1, 2))
+            return value + jnp.einsum("...a,c,cba->...b", value, shares, jnp.asarray(masks))
 
         effects.append(
             Effect(
                 "mutual_coupling",
                 {f"{side}_response": couple},
-                (normal("coupling", 0.1, "1", 2),),
+                (normal("coupling", 0.1, "1", 2 * len(neighbours)),),
                 instance=side,
-                physics=f"One complex coupling between neighbouring {side} elements (real, imaginary).",
-                source="(I + c A) a, A the neighbours: first order of Gupta and Ksienski,"
+                physics=f"Complex coupling of neighbouring {side} elements (real, imaginary), alike for pairs that stand"
+                f" alike: {len(neighbours)} kinds.",
+                source="(I + sum c_d A_d) a, A_d the pairs at displacement d: first order of Gupta and Ksienski,"
                 " IEEE Trans. Antennas Propag. 31 (1983).",
             )
         )
     return effects
+
+
+def _neighbours(array: Float[np.ndarray, "antenna 3"]) -> Float[np.ndarray, "kind antenna antenna"]:
+    """Which elements are neighbours, a mask for each displacement up to its sign."""
+    step = array[:, None] - array[None]
+    distance = np.linalg.norm(step, axis=-1)
+    nearest = distance[distance > 0].min()
+    rounded = np.round(step / nearest, 3)
+    first = np.take_along_axis(rounded, np.argmax(rounded != 0, axis=-1)[..., None], axis=-1)
+    rounded = rounded * np.where(first < 0, -1.0, 1.0)
+    near = (distance > 0) & (distance <= _NEIGHBOUR * nearest)
+    kinds = np.unique(rounded[near], axis=0)
+    return (np.all(rounded == kinds[:, None, None], axis=-1) & near).astype(float)
 
 
 def element_spacing(sites: Sites, data: Data) -> list[Effect]:
