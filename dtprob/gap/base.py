@@ -18,16 +18,19 @@ _PEAKS = 3
 _MOST = 24
 _SHORT = 4
 _LONG = 3
+_POLISHED = 3
+_ENOUGH = 3
+_SAME = 0.1
 _COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
 
 
-def fit_base(problem: Problem, key: jax.Array, starts: int = 4) -> fitting.Fit:
+def fit_base(problem: Problem, key: jax.Array, starts: int = 8) -> fitting.Fit:
     """Posterior mode of the model without effects, the best of several starts.
 
     Args:
         problem: the model on its data.
         key: for prior draws.
-        starts: the centre of the prior and this many less one draws from it.
+        starts: the centre of the prior and at most this many less one draws from it; fewer where the best agree.
 
     Raises:
         InputError: the model has no finite likelihood from any start.
@@ -38,7 +41,8 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 4) -> fitting.Fit:
         fitted = fitting.fit(problem, _sweep_angles(problem, x))
         if np.isfinite(fitted.log_posterior):
             fits.append(fitted)
-        if len(fits) >= 2 and _agree(fits):
+        values = sorted((f.log_posterior for f in fits), reverse=True)
+        if len(values) > _ENOUGH and values[0] - values[_ENOUGH - 1] < _SAME:
             break
     if not fits:
         raise InputError(
@@ -47,7 +51,16 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 4) -> fitting.Fit:
             "none from any start",
             "Check the units of the data and the priors of the model; dtprob.testing.check_model names what breaks.",
         )
-    return polish(problem, max(fits, key=lambda f: f.log_posterior))
+    return max((polish(problem, f) for f in _apart(fits)[:_POLISHED]), key=lambda f: f.log_posterior)
+
+
+def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:
+    """One fit of each optimum, the best first."""
+    kept: list[fitting.Fit] = []
+    for fitted in sorted(fits, key=lambda f: -f.log_posterior):
+        if not kept or kept[-1].log_posterior - fitted.log_posterior > _SAME:
+            kept.append(fitted)
+    return kept
 
 
 def polish(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
@@ -113,12 +126,6 @@ def _peaks(values: np.ndarray, lines: np.ndarray) -> list[tuple[float, np.ndarra
     near = sorted(others, key=lambda k: abs(k - middle))[:_PEAKS]
     others = sorted({*near, *sorted(others, key=lambda k: -best[k])[:_PEAKS]})
     return [(float(best[k]), lines[int(values[:, k].argmax()), k]) for k in others]
-
-
-def _agree(fits: list[fitting.Fit]) -> bool:
-    """Whether the two best fits are one optimum."""
-    values = sorted(f.log_posterior for f in fits)
-    return abs(values[-1] - values[-2]) < 0.1
 
 
 def _sweep_angles(problem: Problem, x: np.ndarray) -> np.ndarray:

@@ -77,10 +77,10 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     say(f"fitting the base model to {problem.n_cluster} clusters")
     base = fit_base(problem, keys[0])
     steps = search(problem, base, keys[1], settings, say)
-    last = steps[-1].view
+    base, last = steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
     assignment = closed.folds(problem.n_cluster, keys[2], settings.folds)
-    held_before = closed.cross_fit(problem, base, assignment)
+    held_before = closed.cross_fit(steps[0].view.problem, base, assignment)
     held_after = (
         closed.cross_fit(last.problem, last.fitted, assignment) if last.fitted.effects else held_before
     )

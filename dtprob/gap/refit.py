@@ -9,12 +9,14 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.base import polish
-from dtprob.gap.plausible import scales, sides
+from dtprob.gap.plausible import nulls, scales, sides
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
 
 _LINES = 12
 """Parameters of an effect along which starting points are looked for."""
+_BETTER = 0.5
+"""Nats by which another optimum has to be higher."""
 _REACH = 0.4
 """Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
@@ -54,6 +56,31 @@ def polished(
     able = [name for name in trials if kinds[name] == "mean" and gain[name] >= reach]
     best = sorted(able, key=lambda name: -gain[name])[:count]
     return {name: polish(problem, one) if name in best else one for name, one in trials.items()}
+
+
+def without(
+    problem: Problem, before: fitting.Fit, trials: Mapping[str, fitting.Fit], count: int
+) -> fitting.Fit | None:
+    """A fit without the tried effects that is better than the one before, found from where their refits went.
+
+    A refit that gains because it left a local optimum of the nuisances says nothing of its effect.
+
+    Args:
+        problem: in which the trials' effects are live.
+        before: the fit without them.
+        trials: refits by the effect's name.
+        count: so many at most are looked at, the best first.
+    """
+    best = sorted(trials, key=lambda name: -trials[name].log_evidence)[:count]
+    fits = []
+    for effect in problem.effects:
+        if effect.name in best and effect.kind == "mean":
+            x = trials[effect.name].x.copy()
+            x[problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)] = nulls(effect)
+            spread = next(iter(before.spread.values()), 0.1)
+            fits.append(fitting.fit(problem, x, before.effects, spread=spread))
+    found = max(fits, key=lambda f: f.log_evidence, default=before)
+    return polish(problem, found) if found.log_evidence > before.log_evidence + _BETTER else None
 
 
 def starting_points(

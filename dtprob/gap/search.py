@@ -16,7 +16,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection, project
-from dtprob.gap.refit import polished, refit, starting_points
+from dtprob.gap.refit import polished, refit, starting_points, without
 from dtprob.gap.scan import Found, scan
 from dtprob.gap.screen import Screening, replicate, screen
 from dtprob.gap.settings import Settings
@@ -27,6 +27,8 @@ type Say = Callable[[str], None]
 _LARGEST_FIELD = 96
 _PREFERRED = 0.9
 """Share of a random field's evidence at which an effect with parameters of its own is preferred."""
+_RETURNS = 3
+"""Times that a search may find its starting fit to be no optimum."""
 _LARGE_GAP = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 
@@ -71,7 +73,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         say: receives one line at each stage.
     """
     steps: list[Step] = []
-    fitted = base
+    fitted, returns = base, 0
     while True:
         say(
             f"screening {len(problem.effects)} effects"
@@ -83,6 +85,11 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         if steps and _promise(seen) < settings.minor * (fitted.log_evidence - base.log_evidence):
             return [*steps, Step(seen, problem, {}, None)]
         problem, trials = _trials(seen, settings, say, first=not steps)
+        better = without(problem, seen.fitted, trials, settings.polished) if returns < _RETURNS else None
+        if better is not None:
+            say("found a better fit without them: starting again from there")
+            fitted, base, returns = better, base if steps else better, returns + 1
+            continue
         accepted = _accept(seen, base, trials, settings)
         steps.append(Step(seen, problem, trials, accepted))
         if accepted is None:
