@@ -196,6 +196,17 @@ class Problem:
         sites = cast("dict[str, Any]", jax.eval_shape(run, self.arrays))
         return {n: s for n, s in sites.items() if jnp.issubdtype(s.dtype, jnp.inexact) and s.size}
 
+    def field_size(self, effect: Effect) -> int:
+        """Entries of a variance effect's field."""
+
+        def run(arrays: Any) -> jax.Array:
+            trace = trace_model(self.model, eqx.combine(arrays, self._static), jax.random.key(0))
+            context = Context(self.data, {n: m["value"] for n, m in trace.items()})
+            grown = self.float_sites[effect.sites[0]]
+            return jnp.zeros(effect.shape_of_field(jnp.zeros(grown.shape, grown.dtype), context))
+
+        return int(np.prod(jax.eval_shape(run, self.arrays).shape, dtype=int))
+
     def _observed_shapes(self) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
         families: dict[str, str] = {}
 

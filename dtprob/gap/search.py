@@ -24,7 +24,10 @@ from dtprob.gap.where import Location, locate
 
 type Say = Callable[[str], None]
 
-_LARGEST_FIELD = 96
+_LARGEST_FIELD = 512
+"""Entries of a field per cluster up to which it is fitted entry by entry."""
+_LARGEST_TANGENTS = 100_000_000
+"""Numbers that the tangents of a field may take: 0.8 GB."""
 _PREFERRED = 0.9
 """Share of a random field's evidence at which an effect with parameters of its own is preferred."""
 _RETURNS = 3
@@ -180,9 +183,9 @@ def _chosen(seen: View, scanned: np.ndarray, settings: Settings) -> list[str]:
 
 
 def _affordable(problem: Problem, name: str) -> bool:
-    """Whether a field is small enough per cluster to be fitted entry by entry."""
+    """Whether a field is small enough to be fitted entry by entry."""
     effect = next(e for e in problem.effects if e.name == name)
     if effect.kind == "mean":
         return True
-    shape = problem.float_sites[effect.sites[0]].shape
-    return int(np.prod(shape, dtype=int)) // problem.n_cluster <= _LARGEST_FIELD
+    size = problem.field_size(effect) // problem.n_cluster
+    return size <= _LARGEST_FIELD and size * problem.rows.gather.size <= _LARGEST_TANGENTS
