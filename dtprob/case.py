@@ -59,6 +59,7 @@ class SceneSection:
         refraction, diffraction, diffuse_reflection: what the twin traces besides specular reflection.
         tx_pattern, rx_pattern, polarization: of the antenna elements, as sionna-rt names them.
         merge_shapes: whether objects of one material become one; false keeps every object apart.
+        skip_unreached: leave out links that no path reaches, instead of refusing the case.
         device_height: m, added to the height of both ends of each link.
         ceiling_height: m, of the rooms of a floor plan.
         wall_material, wall_thickness: of the walls of a floor plan; thickness in m.
@@ -74,6 +75,7 @@ class SceneSection:
     rx_pattern: str = "iso"
     polarization: str = "V"
     merge_shapes: bool = True
+    skip_unreached: bool = False
     device_height: float | None = None
     ceiling_height: float | None = None
     wall_material: str = "brick"

@@ -4,7 +4,7 @@ All quantities are in SI units; the arrays are NumPy arrays in double precision 
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any, final
 
 import numpy as np
@@ -99,6 +99,21 @@ class ChannelData(_Checked):
         self._check(CHANNEL_ARRAYS)
         _check_array(self.rx_array, "rx_array", self.channel.shape[2])
         _check_array(self.tx_array, "tx_array", self.channel.shape[3])
+
+    def take(self, links: Int[np.ndarray, " chosen"]) -> "ChannelData":
+        """The data of some links, in the order given.
+
+        Args:
+            links: indices of links.
+        """
+        noise = self.noise_power
+        return replace(
+            self,
+            channel=self.channel[links],
+            rx_position=self.rx_position[links],
+            tx_position=self.tx_position[links],
+            noise_power=noise[links] if noise is not None and np.ndim(noise) else noise,
+        )
 
 
 @final

@@ -22,7 +22,7 @@ from dtprob.inference.fit import ENGINES
 from dtprob.models.declaration import Model, declare
 from dtprob.usercode import load_object
 from dtprob.workflow.models import MODELS
-from dtprob.workflow.scene import paths_of
+from dtprob.workflow.scene import reached
 
 type Say = Callable[[str], None]
 
@@ -163,12 +163,15 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
         data = _expected(read(file, case.data.options), ChannelData, file, case)
     else:
         data = read_table(file)
+    paths = None
+    if needs_paths and isinstance(data, ChannelData):
+        data, paths = reached(case, data, cache, say)
     columns = data.arrays()
     arguments = {name: _as_jax(array) for name, array in columns.items() if name in takes}
     if case.data.cluster is not None and case.data.cluster in columns:
         arguments[case.data.cluster] = columns[case.data.cluster]
-    if needs_paths and isinstance(data, ChannelData):
-        arguments["paths"] = paths_of(case, data, cache, say)
+    if paths is not None:
+        arguments["paths"] = paths
     if case.data.phase is not None:
         if "phase" in takes:
             arguments["phase"] = case.data.phase

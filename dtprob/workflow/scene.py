@@ -19,6 +19,34 @@ from dtprob.raytracing.paths import PathSet
 _WALL_THICKNESS = 0.12
 
 
+def reached(
+    case: Case, data: ChannelData, cache: Path | None, say: Callable[[str], None]
+) -> tuple[ChannelData, PathSet]:
+    """The data and their path set, without the links that no path reaches where the case asks for that.
+
+    Args:
+        case: the CASE, with its scene.
+        data: what was measured.
+        cache: a folder in which traced paths are kept.
+        say: receives one line before tracing, and one that names links left out.
+
+    Raises:
+        InputError: see `paths_of`; or a link that no path reaches, unless the case asks to skip it.
+    """
+    paths = paths_of(case, data, cache, say)
+    found = np.asarray(paths.mask).any(axis=1)
+    if found.all():
+        return data, paths
+    missed = ", ".join(map(str, np.flatnonzero(~found)[:20])) + (", ..." if np.sum(~found) > 20 else "")
+    if case.scene is None or not case.scene.skip_unreached or not found.any():
+        remedy = "Correct their positions, raise max_depth, or set skip_unreached = true to leave them out"
+        raise InputError(
+            f"{case.path.name} [scene]", "a path or more for each link", f"none for links {missed}", remedy
+        )
+    say(f"leaving out links that no path reaches: {missed}")
+    return data.take(np.flatnonzero(found)), paths.take(found)
+
+
 def paths_of(case: Case, data: ChannelData, cache: Path | None, say: Callable[[str], None]) -> PathSet:
     """The path set of the data's links: read, taken from the cache, or traced.
 
@@ -98,6 +126,7 @@ def _trace(scene: SceneSection, data: ChannelData) -> PathSet:
         rx_pattern=scene.rx_pattern,
         polarization=scene.polarization,
         frequency=frequency,
+        allow_empty=True,
     )
 
 

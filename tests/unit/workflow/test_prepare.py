@@ -3,12 +3,13 @@
 import re
 from pathlib import Path
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dtprob.case import load_case
-from dtprob.data import ChannelData, write
+from dtprob.data import ChannelData, read, write
 from dtprob.errors import InputError
 from dtprob.raytracing import storage
 from dtprob.workflow import prepare
@@ -19,8 +20,6 @@ DEMO = Path(__file__).parents[3] / "dtprob" / "data" / "demo"
 @pytest.fixture
 def folder(tmp_path) -> Path:
     """The first links of the recorded case."""
-    from dtprob.data import read
-
     data = read(DEMO / "channels.npz")
     assert isinstance(data, ChannelData)
     arrays = data.arrays()
@@ -120,6 +119,22 @@ def test_paths_of_other_positions_are_refused(folder):
     storage.save(storage.load(DEMO / "paths.nc").take(np.arange(4)), folder / "paths.nc")
     with pytest.raises(InputError, match="expected the 5 positions of the data, to 1 mm, got 4 positions"):
         prepare(load_case(folder / "case.toml"), need="fit")
+
+
+def test_links_that_no_path_reaches(folder):
+    """They are named, and left out only if the case asks for it."""
+    paths = storage.load(DEMO / "paths.nc").take(np.arange(5))
+    empty = eqx.tree_at(lambda p: p.mask, paths, paths.mask & (jnp.arange(5) != 3)[:, None])
+    storage.save(empty, folder / "paths.nc")
+    with pytest.raises(InputError, match=r"none for links 3\. .*skip_unreached = true"):
+        prepare(load_case(folder / "case.toml"), need="fit")
+    change(folder, "[scene]", "[scene]\nskip_unreached = true")
+    said = []
+    whole = ChannelData(**read(folder / "channels.npz").arrays())
+    prepared = prepare(load_case(folder / "case.toml"), need="fit", say=said.append)
+    assert "leaving out links that no path reaches: 3" in said
+    assert prepared.data["paths"].n_link == 4
+    np.testing.assert_array_equal(prepared.data["channel"], whole.channel[[0, 1, 2, 4]])
 
 
 def test_a_ray_traced_model_needs_a_scene(folder):
