@@ -1,7 +1,7 @@
 # The environment is .venv at the root; every target brings it up to date first (at once when nothing has changed).
 BIN := .venv/bin
 
-.PHONY: setup demo test lint lock
+.PHONY: setup demo test lint bench lock
 
 setup:
 	@sh scripts/setup
@@ -17,6 +17,10 @@ lint: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/pyright
 	$(BIN)/lint-imports
+
+# Each against its rival in the same run; the figures go to benchmarks/results.
+bench: setup
+	for file in benchmarks/bench_*.py; do $(BIN)/python $$file --write; done
 
 # Resolve the dependencies of pyproject.toml anew (needs uv).
 lock:
