@@ -16,6 +16,8 @@ from dtprob.gap.problem import Problem
 
 _FAINT: Final = 1e-3
 """Share of the data's information on a coordinate below which its prior's is not looked at."""
+_ROUNDING: Final = 1e-9
+"""What is left of a coordinate after its fit is taken back, as a share of the fit, is zero below this."""
 
 
 class Known(NamedTuple):
@@ -125,6 +127,7 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     origin = fitted.x.copy()
     origin[active.global_index] -= shared.deviation
     origin[active.local_index] -= own.deviation
+    origin = np.where(np.abs(origin) < _ROUNDING * np.abs(fitted.x), 0.0, origin)
     return Projection(w_global, w_local, local_inverse, jnp.asarray(inverse), reduced, shared, own, origin)
 
 
