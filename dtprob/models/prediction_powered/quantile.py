@@ -176,9 +176,12 @@ class QuantileProblem:
         return float(mix.true), float(mix.unlabelled[0]), float(mix.predicted[0])
 
     def nearest(self, lam: Lambda) -> float:
-        """The value at which the mixed distribution function is nearest the level."""
+        """The least value at which the mixed distribution function is nearest the level.
+
+        Distances are rounded, so that among values equally near the choice is not left to rounding errors.
+        """
         distance = np.abs(self.steps.function(*self.mix(lam)) - self.loss.level)
-        return float(self.steps.value[np.argmin(distance)])
+        return float(self.steps.value[np.argmin(np.round(distance, 12))])
 
     def variance(self, steps: Steps, mix: tuple[float, float, float]) -> Float[np.ndarray, " value"]:
         """Variance of the mixed distribution function at each value."""

@@ -149,9 +149,7 @@ def test_weights_are_repetitions():
     times = np.arange(30) % 3
     repeated = {**values, **{name: np.repeat(values[name], times, axis=0) for name in fields[:3]}}
     weighted = estimate("ols", Sample(**values, weight=times), "ppi")
-    np.testing.assert_allclose(
-        weighted.theta, estimate("ols", Sample(**repeated), "ppi").theta, rtol=1e-9
-    )
+    np.testing.assert_allclose(weighted.theta, estimate("ols", Sample(**repeated), "ppi").theta, rtol=1e-9)
 
 
 def test_without_unlabelled_samples_it_is_erm_and_says_so():
