@@ -14,6 +14,8 @@ from dtprob.models.prediction_powered.schemes import Mix
 
 _MAX_STEPS: Final = 60
 _MAX_HALVINGS: Final = 30
+_FLAT: Final = 1e-8
+"""Curvature over that at the start below which a loss is flat: its minimum is at infinity."""
 
 
 class Newton(NamedTuple):
@@ -24,12 +26,14 @@ class Newton(NamedTuple):
         step: what to subtract from theta.
         decrement: gradient times step: twice what the step is expected to gain.
         condition: smallest curvature, in units that make the curvature along each parameter 1.
+        curvature: along each parameter.
     """
 
     value: Float[Array, ""]
     step: Float[Array, " parameter"]
     decrement: Float[Array, ""]
     condition: Float[Array, ""]
+    curvature: Float[Array, " parameter"]
 
 
 @eqx.filter_jit
@@ -52,7 +56,7 @@ def newton(evaluation: Evaluation, mix: Mix) -> Newton:
     size = jnp.abs(curvature)
     floor = jnp.finfo(size.dtype).eps * len(size)
     step = scale * (vectors @ ((vectors.T @ (scale * gradient)) / jnp.maximum(size, floor)))
-    return Newton(total("value"), step, gradient @ step, jnp.min(size))
+    return Newton(total("value"), step, gradient @ step, jnp.min(size), diagonal)
 
 
 def minimise(
@@ -72,9 +76,11 @@ def minimise(
             (separable labels).
     """
     tolerance = float(jnp.finfo(theta.dtype).eps)
-    move = newton(start, mix)
+    move = first = newton(start, mix)
     _check_condition(move, tolerance, len(theta))
     for _ in range(_MAX_STEPS):
+        if bool(jnp.any(move.curvature < _FLAT * first.curvature)):
+            break
         if loss.traits.quadratic or float(move.decrement) <= tolerance:
             return theta - move.step
         theta, move = _descend(loss, sample, mix, theta, move)

@@ -96,11 +96,27 @@ def tune(
             context (which together minimise the error of all parameters).
         practice: conventions.
     """
+    d, n_context = len(inverse), evaluation.unlabelled.value.shape[0]
+    if by != "context":
+        evaluation = _merged(evaluation)
     if by == "parameter":
-        return jax.vmap(lambda column: _tune(evaluation, column[:, None], practice))(inverse.T)
-    best = _tune(evaluation, inverse, practice)
-    d = len(inverse)
-    return Lambda(*(jnp.broadcast_to(part, (d, *part.shape)) for part in best))
+        best = jax.vmap(lambda column: _tune(evaluation, column[:, None], practice))(inverse.T)
+    else:
+        best = _tune(evaluation, inverse, practice)
+    return Lambda(*(jnp.broadcast_to(part, (d, n_context)) for part in best))
+
+
+def _merged(evaluation: Evaluation) -> Evaluation:
+    """The data as if all contexts were one."""
+
+    def total(part: Array) -> Array:
+        return jnp.sum(part, axis=0, keepdims=True)
+
+    return evaluation._replace(
+        predicted=jax.tree.map(total, evaluation.predicted),
+        unlabelled=jax.tree.map(total, evaluation.unlabelled),
+        context=jnp.zeros_like(evaluation.context),
+    )
 
 
 def _tune(evaluation: Evaluation, root: Float[Array, "parameter r"], practice: Practice) -> Lambda:

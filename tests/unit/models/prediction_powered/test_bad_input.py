@@ -1,0 +1,112 @@
+"""Every wrong input gives one line that says what to do."""
+
+import jax
+import numpy as np
+import pytest
+
+from dtprob.errors import InputError
+from dtprob.models.prediction_powered.bootstrap import bootstrap
+from dtprob.models.prediction_powered.diagnostics import bias_map
+from dtprob.models.prediction_powered.estimate import estimate
+from dtprob.models.prediction_powered.generalised import posterior_data
+from dtprob.models.prediction_powered.predictors import Ridge
+from dtprob.models.prediction_powered.quantile import Quantile
+from dtprob.models.prediction_powered.sample import Sample
+from dtprob.models.prediction_powered.training import train
+from tests.unit.models.prediction_powered.examples import linear, scalar
+
+KEY = jax.random.key(0)
+X, Y = np.arange(12.0).reshape(6, 2), np.arange(6.0)
+NAN = np.where(np.arange(6) == 2, np.nan, Y)
+SAMPLES = {
+    "no labels": ({"y": np.zeros(0)}, "y: expected labels"),
+    "NaN label": ({"y": NAN}, r"y: expected finite numbers, got nan at index 2\. Move samples without"),
+    "text": ({"y": np.array(["a"] * 6)}, "y: expected real numbers"),
+    "NaN feature": ({"y": Y, "x": NAN[:, None]}, r"x: expected finite numbers, got nan at index \(2, 0\)"),
+    "rows of x": ({"y": Y, "x": X[:4]}, r"x: expected shape \(6, feature\)"),
+    "prediction": ({"y": Y, "prediction": Y[:3]}, r"prediction: expected shape \(6,\), got \(3,\)"),
+    "width": (
+        {"y": Y, "x": X, "x_unlabelled": np.zeros((4, 3))},
+        "x_unlabelled: expected width 2, as x has, got width 3",
+    ),
+    "no own predictions": ({"y": Y, "prediction_unlabelled": Y}, "prediction: expected predictions of the"),
+    "negative weight": ({"y": Y, "weight": -Y}, r"weight: expected weights from 0 up, got -1 at index 1"),
+    "no weight": ({"y": Y, "weight": 0 * Y}, "weight: expected a weight above 0"),
+    "context": ({"y": Y, "context": Y}, "context: expected shape"),
+    "strange context": (
+        {
+            "y": Y,
+            "prediction": Y,
+            "prediction_unlabelled": Y,
+            "context": np.zeros(6, int),
+            "context_unlabelled": np.full(6, 2),
+        },
+        "context_unlabelled: expected contexts below 1",
+    ),
+}
+CALLS = {
+    "scheme": (lambda: estimate("mean", scalar(), "tuned-cppi"), r"Did you mean 'tuned_cppi'\?"),
+    "loss": (lambda: estimate("logistc", linear()), r"Did you mean 'logistic'\?"),
+    "no loss": (lambda: estimate(lambda t, x, y: t, linear()), "Wrap a function in CustomLoss"),
+    "level": (lambda: estimate("mean", scalar(), level=90), "level: expected a number between 0 and 1"),
+    "lambda": (lambda: estimate("mean", scalar(), lam=2), "lam: expected a number from 0 to 1"),
+    "lambda of ss": (lambda: estimate("mean", scalar(), "ss", lam=0.5), "lam: expected nothing"),
+    "dependent": (
+        lambda: estimate("ols", Sample(x=np.ones((6, 2)), y=Y), "erm"),
+        "features: expected independent columns",
+    ),
+    "separable": (
+        lambda: estimate("logistic", Sample(x=Y[:, None] - 2.5, y=(Y > 2).astype(float)), "erm"),
+        "corrected loss: expected a minimum",
+    ),
+    "quantile level": (lambda: Quantile(1.0), "quantile: expected a level between 0 and 1"),
+    "quantile of vectors": (lambda: estimate(Quantile(0.5), Sample(y=X), "erm"), "y: expected labels of one"),
+    "posterior of a quantile": (
+        lambda: posterior_data(Quantile(0.5), scalar(), estimate(Quantile(0.5), scalar())),
+        "loss: expected one with a second derivative",
+    ),
+    "few draws": (
+        lambda: bootstrap(KEY, "mean", scalar(), estimate("mean", scalar()), draws=1),
+        "bootstrap: expected 2 or more draws",
+    ),
+    "no map": (lambda: bias_map(Sample(x=X, y=Y)), "bias map: expected scalar labels with predictions"),
+    "few labels": (
+        lambda: train(KEY, "cppi", Ridge(), x=X, y=Y, x_unlabelled=X, folds=7),
+        r"labelled samples: expected at least one per fold \(7\), got 6\. Use 6 folds",
+    ),
+    "one fold": (
+        lambda: train(KEY, "cppi", Ridge(), x=X, y=Y, x_unlabelled=X, folds=1),
+        "folds: expected 2 or more",
+    ),
+    "one class": (
+        lambda: train(KEY, "cppi", Ridge(), x=X, y=(Y == 0) * 1.0, x_unlabelled=X, folds=2, probability=True),
+        "training labels of fold .: expected both classes, got only 0",
+    ),
+    "no predictor": (
+        lambda: train(KEY, "ppi", 3, x=X, y=Y, x_unlabelled=X),
+        "predictor: expected methods fit and predict",
+    ),
+    "unlabelled NaN": (
+        lambda: estimate(
+            "mean", Sample(y=Y, prediction=Y, prediction_unlabelled=np.where(Y == 4, np.nan, Y)), "ppi"
+        ),
+        "prediction_unlabelled: expected finite numbers, got NaN or infinity at sample 4",
+    ),
+}
+
+
+def one_line(function, text):
+    with pytest.raises(InputError, match=text) as caught:
+        function()
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", SAMPLES)
+def test_samples(name):
+    fields, text = SAMPLES[name]
+    one_line(lambda: Sample(**fields), text)
+
+
+@pytest.mark.parametrize("name", CALLS)
+def test_calls(name):
+    one_line(*CALLS[name])
