@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from typing import Final
 
 FIGURES: Final[Mapping[str, str]] = {
+    "fig9": "dtprob.reproduce.fig9",
+    "fig10": "dtprob.reproduce.fig10",
     "label_grid": "dtprob.reproduce.label_grid",
 }
 """For each figure's name, the module that makes it."""
