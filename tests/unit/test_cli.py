@@ -313,6 +313,7 @@ def test_an_interrupted_fit_leaves_no_half_files(case, tmp_path, number, status)
         stderr=subprocess.PIPE,
         text=True,
         env=os.environ | {"PYTHONUNBUFFERED": "1"},
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509  (a background job may ignore it)
     ) as process:
         assert process.stdout is not None
         assert process.stderr is not None
