@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int, PRNGKeyArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dtprob.models.prediction_powered.multioutput import Labelled, Unlabelled, regress
 from dtprob.models.prediction_powered.schemes import SCHEMES, Scheme
@@ -161,7 +161,8 @@ def _synthetic(
 def knowledge_map(known: BeamPaths, sought: Float[np.ndarray, "sought 2"]) -> BeamPaths:
     """The strongest paths interpolated from the nearest positions, by inverse distances; phases are lost."""
     count = min(_NEIGHBOURS, len(known.position))
-    distance, index = cKDTree(known.position).query(sought, k=np.arange(1, count + 1))
+    nearest = np.arange(1, count + 1)
+    distance, index = KDTree(known.position).query(sought, k=nearest)  # pyright: ignore[reportArgumentType]
     closeness = 1 / np.maximum(distance, 1e-6)
     share = (closeness / closeness.sum(axis=1, keepdims=True))[..., None]
     amplitude = np.abs(known.gain[:, :_MAPPED_PATHS])[index]
