@@ -187,7 +187,7 @@ def _direction(
             return np.broadcast_to(step.reshape(shape), value.shape) * (value if relative else 1.0)
     kept = [] if label == "common" else label.split(" x ")
     floor = 1e-12 * max(float(variance.max(initial=0.0)), 1e-300)
-    step = np.where(variance > floor, score / np.maximum(variance, max(floor, 1e-300)), 0.0)
+    step = np.where(variance > floor, score / np.where(variance > floor, variance, 1.0), 0.0)
     shape = [n if axes[i] in kept and n > 1 else 1 for i, n in enumerate(value.shape)]
     if np.iscomplexobj(value):
         pair = step.reshape(*shape, 2)
