@@ -17,8 +17,8 @@ from scipy.spatial import KDTree
 from dtprob.models.prediction_powered.multioutput import Labelled, Unlabelled, regress
 from dtprob.models.prediction_powered.schemes import SCHEMES, Scheme
 from dtprob.models.prediction_powered.training import assign_folds
-from dtprob.physical.beams import BeamPaths, Site, trace_positions
-from dtprob.physical.beams_codebook import OVERSAMPLING, VERTICAL, Beams, rates, shares
+from dtprob.reproduce.beams import BeamPaths, Site, trace_positions
+from dtprob.reproduce.beams_codebook import OVERSAMPLING, VERTICAL, Beams, rates, shares
 from dtprob.reproduce.figure import Quantity
 from dtprob.reproduce.progress import Progress
 

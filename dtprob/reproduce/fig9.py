@@ -7,8 +7,8 @@ import numpy as np
 from jaxtyping import PRNGKeyArray
 
 from dtprob.models.prediction_powered.schemes import SCHEMES
-from dtprob.physical.beams_codebook import VERTICAL
 from dtprob.reproduce import beam_alignment
+from dtprob.reproduce.beams_codebook import VERTICAL
 from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
 from dtprob.reproduce.progress import Progress
 

@@ -5,10 +5,10 @@ import numpy as np
 import pytest
 
 from dtprob.models.prediction_powered.schemes import SCHEMES
-from dtprob.physical.beams import BeamPaths, Site
-from dtprob.physical.beams_codebook import VERTICAL, Beams, grid, rates, response, shares
 from dtprob.reproduce import beam_alignment, fig9, fig10
 from dtprob.reproduce.beam_alignment import Campaign, knowledge_map, labels
+from dtprob.reproduce.beams import BeamPaths, Site
+from dtprob.reproduce.beams_codebook import VERTICAL, Beams, grid, rates, response, shares
 from dtprob.reproduce.progress import Progress
 
 KEY = jax.random.key(4)

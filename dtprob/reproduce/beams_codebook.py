@@ -10,7 +10,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Complex, Float, Int
 
-from dtprob.physical.beams import BeamPaths
+from dtprob.reproduce.beams import BeamPaths
 
 VERTICAL: Final = 10
 """Elements of a column."""
