@@ -11,6 +11,7 @@ import numpyro.distributions as dist
 
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import declare, model
+from dtprob.models.scene import AXES
 from dtprob.raytracing import field
 from dtprob.raytracing.geometry import unfold
 from dtprob.raytracing.paths import NONE, REFRACTION, SPECULAR, PathSet, validate
@@ -105,21 +106,7 @@ def _sum(gain, delay, phase, responses, subcarrier_frequency):
 
 
 @model(
-    axes={
-        "permittivity": ("object",),
-        "conductivity": ("object",),
-        "thickness": ("object",),
-        "path_gain": ("link", "path"),
-        "path_delay": ("link", "path"),
-        "departure": ("link", "path", "direction"),
-        "arrival": ("link", "path", "direction"),
-        "path_phase": ("link", "snapshot", "path"),
-        "tx_response": ("link", "path", "tx_antenna"),
-        "rx_response": ("link", "path", "rx_antenna"),
-        "frequency_response": ("subcarrier",),
-        "noiseless_channel": CHANNEL_AXES,
-        "noise_power": CHANNEL_AXES,
-    },
+    axes={**AXES, "thickness": ("object",)},
     cluster="link",
 )
 def world_channel(

@@ -16,7 +16,6 @@ from jaxtyping import Array, Float
 
 from dtprob.effects.common import (
     CHANNEL_AXES,
-    SIDES,
     Data,
     Family,
     Sites,
@@ -25,17 +24,14 @@ from dtprob.effects.common import (
     complex_of,
     each_antenna,
     half_normal,
-    has_phase,
-    n_antenna,
     normal,
     offers,
     on_axis,
     phasor,
 )
 from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.effects.elements import DIRECTION, Advance, arrays, ends, phase_rewrite
 
-_SIGN: Final = {"rx": -1.0, "tx": 1.0}
-_DIRECTION: Final = {"rx": "arrival", "tx": "departure"}
 _NEIGHBOUR: Final = 1.5
 """Elements count as neighbours up to this multiple of the smallest distance, so those across a square do."""
 
@@ -43,7 +39,7 @@ _NEIGHBOUR: Final = 1.5
 def array_calibration(sites: Sites, _data: Data) -> list[Effect]:
     """Complex gains of the chains behind the elements: all against the first, or one element alone."""
     effects = []
-    for side, count in _ends(sites):
+    for side, count in ends(sites):
 
         def weigh_all(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
             first = jnp.zeros(1)
@@ -85,7 +81,7 @@ def cable_delay(sites: Sites, data: Data) -> list[Effect]:
     if measured is None:
         return []
     effects = []
-    for side, count in _ends(sites):
+    for side, count in ends(sites):
         for index, name in each_antenna(count, side) or [(1, f"{side}_1")]:
             axis = f"{side}_antenna"
 
@@ -118,7 +114,7 @@ def cable_delay(sites: Sites, data: Data) -> list[Effect]:
 def mutual_coupling(sites: Sites, data: Data) -> list[Effect]:
     """Every element picks up a share of what its neighbours see, one share for each way to a neighbour."""
     effects = []
-    for side, _ in _ends(sites):
+    for side, _ in ends(sites):
         array = array_of(data, side)
         if array is None:
             continue
@@ -167,7 +163,7 @@ def element_spacing(sites: Sites, data: Data) -> list[Effect]:
             physics=f"All distances between {side} elements are off by one relative amount.",
             source="exp(-+j 2 pi / lambda (1 + s) r.k).",
         )
-        for side in _arrays(sites, data)
+        for side in arrays(sites, data)
     ]
 
 
@@ -188,15 +184,15 @@ def near_field(sites: Sites, data: Data) -> list[Effect]:
             physics=f"Quadratic phase over the {side} array; share 1 is the sphere of the unfolded length.",
             source="Fresnel: |L k + r| = L + r.k + (|r|^2 - (r.k)^2) / (2 L).",
         )
-        for side in _arrays(sites, data)
+        for side in arrays(sites, data)
     ]
 
 
 def angular_spread(sites: Sites, data: Data) -> list[Effect]:
     """Each path comes from (goes to) a direction that differs at random from the traced one."""
     effects = []
-    for side in _arrays(sites, data):
-        if not offers(sites, _DIRECTION[side]):
+    for side in arrays(sites, data):
+        if not offers(sites, DIRECTION[side]):
             continue
 
         def spread(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
@@ -206,7 +202,7 @@ def angular_spread(sites: Sites, data: Data) -> list[Effect]:
         effects.append(
             Effect(
                 "angular_spread",
-                {_DIRECTION[side]: spread},
+                {DIRECTION[side]: spread},
                 (half_normal("scale", 0.03, "rad"),),
                 instance=side,
                 kind="variance",
@@ -217,41 +213,22 @@ def angular_spread(sites: Sites, data: Data) -> list[Effect]:
     return effects
 
 
-def _ends(sites: Sites) -> list[tuple[str, int]]:
-    """The ends with several antennas in a model with phases, and their number of antennas."""
-    if not has_phase(sites):
-        return []
-    return [(side, n_antenna(sites, side)) for side in SIDES if n_antenna(sites, side) > 1]
-
-
-def _arrays(sites: Sites, data: Data) -> dict[str, np.ndarray]:
-    """Element positions at the ends with several antennas, where they and the directions are known."""
-    found = {side: array_of(data, side) for side, _ in _ends(sites) if offers(sites, _DIRECTION[side])}
-    return {side: array for side, array in found.items() if array is not None and "paths" in data}
-
-
 def _gain(log_gain: Float[Array, "*n"], phase: Float[Array, "*n"]) -> jax.Array:
     return jnp.exp(log_gain) * phasor(phase)
 
 
 def _phase_effect(
-    family: str, side: str, parameter: Parameter, advance: Any, *, physics: str, source: str
+    family: str, side: str, parameter: Parameter, advance: Advance, *, physics: str, source: str
 ) -> Effect:
     """An effect that adds advance(p, k, r, context), in m along the wave, to the phase of every element."""
-
-    def turn(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        paths, positions = context["paths"], jnp.asarray(context[f"{side}_array"])
-        metres = advance(p, context[_DIRECTION[side]], positions, context)
-        return value * phasor(_SIGN[side] * 2 * jnp.pi / paths.wavelength * metres)
-
     return Effect(
         family,
-        {f"{side}_response": turn},
+        {f"{side}_response": phase_rewrite(side, advance)},
         (parameter,),
         instance=side,
         physics=physics,
         source=source,
-        requires=("paths", f"{side}_array", _DIRECTION[side]),
+        requires=("paths", f"{side}_array", DIRECTION[side]),
     )
 
 

@@ -24,9 +24,8 @@ from dtprob.effects.common import (
     offers,
 )
 from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.elements import DIRECTION
 from dtprob.raytracing.paths import PathSet
-
-_DIRECTION: Final = {"rx": "arrival", "tx": "departure"}
 
 
 def gain_offset(sites: Sites, _data: Data) -> list[Effect]:
@@ -127,7 +126,7 @@ def antenna_pattern(sites: Sites, data: Data) -> list[Effect]:
     for side in SIDES:
 
         def weigh(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], side: str = side) -> Any:
-            direction = getattr(context["paths"], _DIRECTION[side])
+            direction = getattr(context["paths"], DIRECTION[side])
             return value * jnp.exp(_harmonics(direction) @ p["log_gain"])
 
         effects.append(

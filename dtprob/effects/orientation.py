@@ -5,43 +5,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dtprob.effects.common import (
-    SIDES,
-    Data,
-    Family,
-    Sites,
-    along,
-    array_of,
-    has_phase,
-    n_antenna,
-    normal,
-    observable_basis,
-    offers,
-    phasor,
-)
+from dtprob.effects.common import Data, Family, Sites, along, normal, observable_basis, offers
 from dtprob.effects.effect import Effect, Rewrite
-from dtprob.raytracing.field import path_gain
+from dtprob.effects.elements import DIRECTION, arrays, gain_of_field, phase_rewrite
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.pattern import PATTERNS, field_vector
 
-_SIGN: Final = {"rx": -1.0, "tx": 1.0}
-_DIRECTION: Final = {"rx": "arrival", "tx": "departure"}
 _SAME: Final = 1e-6
 
 
 def antenna_orientation(sites: Sites, data: Data) -> list[Effect]:
     """The array is turned with its elements, whose pattern and polarisation turn along where they are known."""
     effects = []
-    for side in SIDES:
-        array, several = array_of(data, side), n_antenna(sites, side) > 1
-        known = offers(sites, f"{side}_response", _DIRECTION[side]) and data.get("paths") is not None
-        if array is None or not (several and known and has_phase(sites)):
-            continue
+    for side, array in arrays(sites, data).items():
         basis = observable_basis(np.cross(array[:, None], np.eye(3)[None]).reshape(-1, 3))
         if not len(basis):
             continue
@@ -57,7 +37,7 @@ def antenna_orientation(sites: Sites, data: Data) -> list[Effect]:
                 instance=side,
                 physics=f"The {side} array is turned about its centre, around {along(basis)}.",
                 source="r' = R r and F'(k) = R F(R^T k), R by Rodrigues from 2 tan(angle / 2) times the axis.",
-                requires=("paths", f"{side}_array", _DIRECTION[side]),
+                requires=("paths", f"{side}_array", DIRECTION[side]),
             )
         )
     return effects
@@ -65,15 +45,10 @@ def antenna_orientation(sites: Sites, data: Data) -> list[Effect]:
 
 def _elsewhere(side: str, basis: np.ndarray) -> Rewrite:
     """The phase of every element at its new place."""
-
-    def turn(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        paths, positions = context["paths"], jnp.asarray(context[f"{side}_array"])
-        direction = context[_DIRECTION[side]]
-        moved = turned(positions, p["rotation"] @ jnp.asarray(basis))
-        metres = jnp.einsum("...x,ax->...a", direction, moved)
-        return value * phasor(_SIGN[side] * 2 * jnp.pi / paths.wavelength * metres)
-
-    return turn
+    return phase_rewrite(
+        side,
+        lambda p, k, r, _: jnp.einsum("...x,ax->...a", k, turned(r, p["rotation"] @ jnp.asarray(basis))),
+    )
 
 
 def _looks_elsewhere(side: str, basis: np.ndarray, pattern: str, slant: str | float) -> Rewrite:
@@ -86,14 +61,7 @@ def _looks_elsewhere(side: str, basis: np.ndarray, pattern: str, slant: str | fl
         there = field_vector(direction + turned(direction, -rotation), pattern=pattern, polarization=slant)
         here = field_vector(direction, pattern=pattern, polarization=slant)
         change = there - here + turned(there, rotation)
-        changed = eqx.tree_at(lambda q: getattr(q, f"{side}_field"), paths, change)
-        return value + path_gain(
-            changed,
-            context["permittivity"],
-            context["conductivity"],
-            thickness=context.get("thickness"),
-            law=context.get("law", "slab"),
-        )
+        return value + gain_of_field(side, change, context)
 
     return turn
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, Final
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -24,8 +23,8 @@ from dtprob.effects.common import (
     touched_objects,
 )
 from dtprob.effects.effect import Effect, Parameter, Rewrite
+from dtprob.effects.elements import gain_of_field
 from dtprob.effects.unfolding import mirror
-from dtprob.raytracing.field import path_gain
 from dtprob.raytracing.paths import REFRACTION, SPECULAR, PathSet
 
 
@@ -82,20 +81,12 @@ def thickness_mismatch(sites: Sites, data: Data) -> list[Effect]:
 
 def reflection_loss(sites: Sites, data: Data) -> list[Effect]:
     """Every reflection from an object has an extra loss and phase."""
-
-    def change(index: int) -> Rewrite:
-        def weaken(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-            count = jnp.sum(meets(context["paths"], index, (SPECULAR,)), axis=-1)
-            return value * jnp.exp(-p["loss"] * count) * phasor(p["phase"] * count)
-
-        return weaken
-
     return _per_object(
         "reflection_loss",
         sites,
         data,
         SPECULAR,
-        change=change,
+        change=_each_time(SPECULAR),
         parameters=(normal("loss", 0.3, "Np"), normal("phase", 0.3, "rad")),
         physics="Each reflection from {} is weaker and turned, at any angle: coating, texture.",
         source="a exp(n (-l + j phi)), n reflections.",
@@ -127,20 +118,12 @@ def rough_surface(sites: Sites, data: Data) -> list[Effect]:
 
 def penetration(sites: Sites, data: Data) -> list[Effect]:
     """Every passage through an object has an extra loss and phase."""
-
-    def change(index: int) -> Rewrite:
-        def weaken(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-            count = jnp.sum(meets(context["paths"], index, (REFRACTION,)), axis=-1)
-            return value * jnp.exp(-p["loss"] * count) * phasor(p["phase"] * count)
-
-        return weaken
-
     return _per_object(
         "penetration",
         sites,
         data,
         REFRACTION,
-        change=change,
+        change=_each_time(REFRACTION),
         parameters=(normal("loss", 0.3, "Np"), normal("phase", 0.3, "rad")),
         physics="Each passage through {} is weaker and turned: layers, insulation, furniture.",
         source="a exp(n (-l + j phi)), n passages; ITU-R P.2040.",
@@ -176,16 +159,22 @@ def _polarized(side: str) -> Rewrite:
         along = jnp.cos(p["rotation"]) * jnp.cos(p["ellipticity"]) - 1.0
         crossed = jnp.sin(p["rotation"]) + 1j * jnp.cos(p["rotation"]) * jnp.sin(p["ellipticity"])
         change = along * element + crossed * jnp.cross(direction, element)
-        changed = eqx.tree_at(lambda q: getattr(q, f"{side}_field"), paths, change)
-        return value + path_gain(
-            changed,
-            context["permittivity"],
-            context["conductivity"],
-            thickness=context.get("thickness"),
-            law=context.get("law", "slab"),
-        )
+        return value + gain_of_field(side, change, context)
 
     return rotate
+
+
+def _each_time(code: int) -> Callable[[int], Rewrite]:
+    """For an object, the loss and phase that every interaction of one kind with it adds to a path."""
+
+    def change(index: int) -> Rewrite:
+        def weaken(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+            count = jnp.sum(meets(context["paths"], index, (code,)), axis=-1)
+            return value * jnp.exp(-p["loss"] * count) * phasor(p["phase"] * count)
+
+        return weaken
+
+    return change
 
 
 def _only(value: Float[Array, " object"], index: int) -> Array:

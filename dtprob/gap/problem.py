@@ -91,7 +91,7 @@ class Problem:
         """The same problem with other live effects; what does not depend on them is shared."""
         if set(names) <= {e.name for e in self.live}:
             return self
-        _ = self.programs, self.float_sites  # made once, then shared
+        _ = self.programs, self.float_sites, self.field_shapes  # made once, then shared
         other = copy(self)
         other.set_live(tuple(e for e in self.effects if e.name in names))
         return other
@@ -196,16 +196,23 @@ class Problem:
         sites = cast("dict[str, Any]", jax.eval_shape(run, self.arrays))
         return {n: s for n, s in sites.items() if jnp.issubdtype(s.dtype, jnp.inexact) and s.size}
 
-    def field_size(self, effect: Effect) -> int:
-        """Entries of a variance effect's field."""
+    @cached_property
+    def field_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of the field of each variance effect."""
+        fields = [e for e in self.effects if e.kind == "variance" and e.sites[0] in self.float_sites]
 
-        def run(arrays: Any) -> jax.Array:
-            trace = trace_model(self.model, eqx.combine(arrays, self._static), jax.random.key(0))
-            context = Context(self.data, {n: m["value"] for n, m in trace.items()})
-            grown = self.float_sites[effect.sites[0]]
-            return jnp.zeros(effect.shape_of_field(jnp.zeros(grown.shape, grown.dtype), context))
+        def run(arrays: Any) -> dict[str, jax.Array]:
+            data = eqx.combine(arrays, self._static)
+            trace = trace_model(self.model, data, jax.random.key(0))
+            context = Context(data, {n: m["value"] for n, m in trace.items()})
+            shapes = {}
+            for effect in fields:
+                grown = self.float_sites[effect.sites[0]]
+                value = jnp.broadcast_to(trace[effect.sites[0]]["value"], grown.shape)
+                shapes[effect.name] = jnp.zeros(effect.shape_of_field(value, context))
+            return shapes
 
-        return int(np.prod(jax.eval_shape(run, self.arrays).shape, dtype=int))
+        return {n: tuple(v.shape) for n, v in jax.eval_shape(run, self.arrays).items()}
 
     def _observed_shapes(self) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
         families: dict[str, str] = {}
@@ -226,17 +233,10 @@ class Problem:
         def run(arrays: Any) -> dict[str, Any]:
             data = eqx.combine(arrays, self._static)
             trace = trace_model(self.model, data, jax.random.key(0))
-            shapes = {
+            return {
                 n: jnp.zeros(transform_of(trace[n]["fn"]).inverse_shape(jnp.shape(trace[n]["value"])))
                 for n in self.declaration.latent
             }
-            context = {**data, **{n: m["value"] for n, m in trace.items()}}
-            for effect in self.live:
-                if effect.kind == "variance":
-                    grown = self.float_sites[effect.sites[0]]
-                    value = jnp.broadcast_to(trace[effect.sites[0]]["value"], grown.shape)
-                    shapes[effect.site_name(FIELD)] = jnp.zeros(effect.shape_of_field(value, context))
-            return shapes
 
         shapes = {
             n: tuple(v.shape) for n, v in cast("dict[str, Any]", jax.eval_shape(run, self.arrays)).items()
@@ -249,7 +249,7 @@ class Problem:
         for effect in self.live:
             if effect.kind == "variance":
                 name, axes = effect.site_name(FIELD), self.declaration.sites[effect.sites[0]].axes
-                entries.append((name, effect.name, shapes[name], axes))
+                entries.append((name, effect.name, self.field_shapes[effect.name], axes))
             else:
                 entries += [(effect.site_name(p.name), effect.name, p.shape, ()) for p in effect.parameters]
         return make_layout(entries, self.declaration.cluster, self.rows.n_cluster)

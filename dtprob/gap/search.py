@@ -187,5 +187,5 @@ def _affordable(problem: Problem, name: str) -> bool:
     effect = next(e for e in problem.effects if e.name == name)
     if effect.kind == "mean":
         return True
-    size = problem.field_size(effect) // problem.n_cluster
+    size = int(np.prod(problem.field_shapes[name], dtype=int)) // problem.n_cluster
     return size <= _LARGEST_FIELD and size * problem.rows.gather.size <= _LARGEST_TANGENTS

@@ -43,7 +43,7 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
     checked = validate(report)
     charts = list(all_charts(checked, gap))
     return (
-        _environment()
+        environment()
         .get_template("page.html.jinja")
         .render(
             title=title,
@@ -83,17 +83,18 @@ def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
     return sorted(candidates, key=rank)
 
 
-def _environment() -> Environment:
-    environment = Environment(
+def environment() -> Environment:
+    """The templates, with the filters and functions that they use."""
+    made = Environment(
         loader=PackageLoader("dtprob.report", "templates"),
         autoescape=True,
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters |= {function.__name__: function for function in _FILTERS}
-    environment.globals |= {function.__name__: function for function in _FUNCTIONS}
-    return environment
+    made.filters |= {function.__name__: function for function in _FILTERS}
+    made.globals |= {function.__name__: function for function in _FUNCTIONS}
+    return made
 
 
 _FILTERS: tuple[Callable[..., Any], ...] = (

@@ -3,8 +3,7 @@
 from collections.abc import Mapping
 from typing import Any
 
-from jinja2 import Environment, PackageLoader, StrictUndefined
-
+from dtprob.report.page import environment
 from dtprob.report.palette import DARK, LIGHT
 
 
@@ -17,11 +16,4 @@ def render_score(score: Mapping[str, Any]) -> str:
     Returns:
         the text of an HTML file: no script, no request.
     """
-    environment = Environment(
-        loader=PackageLoader("dtprob.report", "templates"),
-        autoescape=True,
-        undefined=StrictUndefined,
-        trim_blocks=True,
-        lstrip_blocks=True,
-    )
-    return environment.get_template("score.html.jinja").render(score=score, light=LIGHT, dark=DARK)
+    return environment().get_template("score.html.jinja").render(score=score, light=LIGHT, dark=DARK)
