@@ -11,12 +11,16 @@ from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
 from dtprob.inference.point import Point
 from dtprob.inference.posterior import PointMass, Posterior, Sampler
+from dtprob.inference.smc import SMC
 from dtprob.inference.summary import summary
+from dtprob.inference.svi import SVI
 from dtprob.inference.von_mises_em import VonMisesEM
 
 __all__ = [
     "ENGINES",
     "NUTS",
+    "SMC",
+    "SVI",
     "AbstractEngine",
     "BlackJAXNUTS",
     "Laplace",

@@ -6,7 +6,7 @@ algorithm parameters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -18,13 +18,9 @@ from blackjax.adaptation.step_size import dual_averaging_adaptation
 from blackjax.mcmc import nuts
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from dtprob.inference.chains import ChainMethod
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions
 from dtprob.inference.kernel import Place, Stats, lifted_log_density
-from dtprob.inference.posterior import Posterior
-from dtprob.inference.run import Schedule, run_chains
+from dtprob.inference.no_u_turn import AbstractNoUTurn
 from dtprob.inference.target import Target
-from dtprob.models.declaration import Model
 
 
 class ChainState(NamedTuple):
@@ -118,40 +114,11 @@ def _density(target: Target, place: Place) -> Callable[[Array], Array]:
 
 
 @dataclass(frozen=True)
-class BlackJAXNUTS(AbstractEngine):
-    """The No-U-Turn sampler of BlackJAX; the same settings and promises as `NUTS`.
-
-    Attributes:
-        draws: draws of each chain.
-        warmup: steps of each chain before them, in which it adapts.
-        chains: how many chains.
-        target_accept: acceptance rate that the step size is adapted to.
-        max_tree_depth: bound on the doublings of a trajectory.
-        dense_mass: adapt a full mass matrix rather than a diagonal one.
-        chain_method: "sequential" or "vectorized": chains one after the other, or side by side, which is
-            faster on a GPU but makes the last bits of a draw depend on the number of chains.
-        initial: constrained values that every chain starts from; sites without one start from the prior.
-    """
+class BlackJAXNUTS(AbstractNoUTurn):
+    """The No-U-Turn sampler of BlackJAX; the settings and promises are those of `nuts`."""
 
     name: ClassVar[str] = "blackjax_nuts"
-    answer: ClassVar[Answer] = "exact"
 
-    draws: int = 1000
-    warmup: int = 1000
-    chains: int = 4
-    target_accept: float = 0.8
-    max_tree_depth: int = 10
-    dense_mass: bool = False
-    chain_method: ChainMethod = "sequential"
-    initial: Mapping[str, Any] | None = None
-
-    def __call__(
-        self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
-    ) -> Posterior:
-        """Infer; see `AbstractEngine`."""
-
-        def kernel(warmup: int) -> BlackJAXKernel:
-            return BlackJAXKernel(warmup, self.target_accept, self.max_tree_depth, self.dense_mass)
-
-        schedule = Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial)
-        return run_chains(self, kernel, schedule, key, model=model, data=data, options=options)
+    def kernel(self, warmup: int) -> BlackJAXKernel:
+        """BlackJAX's transition."""
+        return BlackJAXKernel(warmup, self.target_accept, self.max_tree_depth, self.dense_mass)

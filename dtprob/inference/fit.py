@@ -15,11 +15,13 @@ from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
 from dtprob.inference.point import Point
 from dtprob.inference.posterior import Posterior
+from dtprob.inference.smc import SMC
+from dtprob.inference.svi import SVI
 from dtprob.inference.von_mises_em import VonMisesEM
 from dtprob.models.declaration import Model
 
 ENGINES: Mapping[str, type[AbstractEngine]] = {
-    engine.name: engine for engine in (NUTS, BlackJAXNUTS, VonMisesEM, Laplace, Point)
+    engine.name: engine for engine in (NUTS, BlackJAXNUTS, SMC, SVI, VonMisesEM, Laplace, Point)
 }
 
 

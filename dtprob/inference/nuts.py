@@ -7,22 +7,18 @@ flexible and accelerated probabilistic programming in NumPyro (2019).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro.infer.hmc import HMCState, hmc
 
-from dtprob.inference.chains import ChainMethod
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions
 from dtprob.inference.kernel import Place, Stats, lifted_log_density
-from dtprob.inference.posterior import Posterior
-from dtprob.inference.run import Schedule, run_chains
+from dtprob.inference.no_u_turn import AbstractNoUTurn
 from dtprob.inference.target import Target
-from dtprob.models.declaration import Model
 
 
 @dataclass(frozen=True)
@@ -87,43 +83,11 @@ def _without_keys(state: HMCState) -> HMCState:
 
 
 @dataclass(frozen=True)
-class NUTS(AbstractEngine):
-    """The No-U-Turn sampler of NumPyro, with windowed adaptation.
-
-    A draw depends on the key, its chain and its place in the chain; not on chunks, interruptions, or how many
-    chains or draws there are. Angles do not get stuck at +-pi; see `dtprob.inference.winding`.
-
-    Attributes:
-        draws: draws of each chain.
-        warmup: steps of each chain before them, in which it adapts.
-        chains: how many chains.
-        target_accept: acceptance rate that the step size is adapted to.
-        max_tree_depth: bound on the doublings of a trajectory.
-        dense_mass: adapt a full mass matrix rather than a diagonal one.
-        chain_method: "sequential" or "vectorized": chains one after the other, or side by side, which is
-            faster on a GPU but makes the last bits of a draw depend on the number of chains.
-        initial: constrained values that every chain starts from; sites without one start from the prior.
-    """
+class NUTS(AbstractNoUTurn):
+    """The No-U-Turn sampler of NumPyro; the settings are those of `AbstractNoUTurn`."""
 
     name: ClassVar[str] = "nuts"
-    answer: ClassVar[Answer] = "exact"
 
-    draws: int = 1000
-    warmup: int = 1000
-    chains: int = 4
-    target_accept: float = 0.8
-    max_tree_depth: int = 10
-    dense_mass: bool = False
-    chain_method: ChainMethod = "sequential"
-    initial: Mapping[str, Any] | None = None
-
-    def __call__(
-        self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
-    ) -> Posterior:
-        """Infer; see `AbstractEngine`."""
-
-        def kernel(warmup: int) -> NumPyroKernel:
-            return NumPyroKernel(warmup, self.target_accept, self.max_tree_depth, self.dense_mass)
-
-        schedule = Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial)
-        return run_chains(self, kernel, schedule, key, model=model, data=data, options=options)
+    def kernel(self, warmup: int) -> NumPyroKernel:
+        """NumPyro's transition."""
+        return NumPyroKernel(warmup, self.target_accept, self.max_tree_depth, self.dense_mass)

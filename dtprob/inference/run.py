@@ -8,8 +8,6 @@ on where chunks end, on an interruption, or on how many chains and draws there a
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
@@ -21,10 +19,11 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dtprob.errors import InputError
 from dtprob.inference import checkpoint
-from dtprob.inference.assemble import assemble, provenance
+from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
 from dtprob.inference.chains import START, Chain, ChainMethod, Walk, advance, recentre, start
 from dtprob.inference.engine import AbstractEngine, RunOptions, check_counts, check_key
+from dtprob.inference.identity import identity
 from dtprob.inference.kernel import Kernel
 from dtprob.inference.modes import starting_points
 from dtprob.inference.posterior import Posterior
@@ -109,8 +108,8 @@ class _Loop:
     def run(self) -> dict[str, np.ndarray]:
         """All draws and statistics by name, (chain, draw, ...)."""
         keys = jax.vmap(jax.random.fold_in, (None, 0))(self.key, jnp.arange(self.schedule.chains))
-        identity = self._identity() if self.options.checkpoint else {}
-        done, chains, kept = self._begin(keys, identity)
+        wanted = self._wanted() if self.options.checkpoint else {}
+        done, chains, kept = self._begin(keys, wanted)
         total = self.schedule.total
         with Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress:
             while done < total:
@@ -121,9 +120,13 @@ class _Loop:
                 if done >= self.walk.warmup:
                     kept += blocks
                 done = end
-                self._save(identity, done, chains, kept)
+                self._save(wanted, done, chains, kept)
                 progress.report(done, "draws" if done > self.walk.warmup else "warmup", _note(kept))
         return _joined(kept)
+
+    def _wanted(self) -> dict[str, Any]:
+        """What a checkpoint must be of; it may have fewer draws."""
+        return identity(self.target, self.inputs, self.engine, self.key, free=("draws",))
 
     def _compiled(self, function: Callable[..., Any], *settings: Any) -> Callable[..., Any]:
         return self.target.compiled(function, self.walk, *settings)
@@ -146,13 +149,13 @@ class _Loop:
         return min(done + self.options.chunk, *(end for end in ends if end > done))
 
     def _begin(
-        self, keys: PRNGKeyArray, identity: Mapping[str, Any]
+        self, keys: PRNGKeyArray, wanted: Mapping[str, Any]
     ) -> tuple[int, Chain, list[dict[str, np.ndarray]]]:
         path = self.options.checkpoint
         begin = self._compiled(start)
         if not self.options.resume or path is None or not path.exists():
             return 0, begin(self._starting_points(keys), keys, self.inputs), []
-        found = checkpoint.read(path, identity)
+        found = checkpoint.read(path, wanted)
         if found.done > self.schedule.total:
             expected, got = f"at most {self.schedule.total} steps", str(found.done)
             raise InputError(f"checkpoint {path}", expected, got, "Ask for as many draws as it has, or more")
@@ -179,24 +182,12 @@ class _Loop:
         return jnp.stack(points)
 
     def _save(
-        self, identity: Mapping[str, Any], done: int, chains: Chain, kept: list[dict[str, np.ndarray]]
+        self, wanted: Mapping[str, Any], done: int, chains: Chain, kept: list[dict[str, np.ndarray]]
     ) -> None:
         if self.options.checkpoint is not None:
             state = [np.asarray(leaf) for leaf in jax.tree.leaves(chains)]
             snapshot = checkpoint.Snapshot(done, state, _joined(kept) if kept else {})
-            checkpoint.write(self.options.checkpoint, identity, snapshot)
-
-    def _identity(self) -> dict[str, Any]:
-        """Everything that the draws depend on, but for how many there are."""
-        facts = provenance(self.target, self.inputs, self.engine, self.key)
-        facts["settings"] = {name: value for name, value in facts["settings"].items() if name != "draws"}
-        return facts | {"density": _density_hash(self.target, self.inputs)}
-
-
-def _density_hash(target: Target, inputs: Inputs) -> str:
-    """SHA-256 of the log density's program, memory addresses left out."""
-    program = str(jax.make_jaxpr(target.log_density)(jnp.zeros(target.dimension), inputs))
-    return hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", program).encode()).hexdigest()
+            checkpoint.write(self.options.checkpoint, wanted, snapshot)
 
 
 def _joined(kept: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -114,6 +114,11 @@ class Target:
         """Indices of the coordinates that are angles."""
         return np.flatnonzero(self.circular)
 
+    @property
+    def linear(self) -> np.ndarray:
+        """Indices of the coordinates that are not angles."""
+        return np.flatnonzero(~self.circular)
+
     def compiled(self, function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
         """`function(self, *static, ...)` compiled, once per shape of its further arguments.
 

@@ -14,11 +14,11 @@ from typing import Any, ClassVar, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from jax.scipy.special import i0e, i1e
-from jaxtyping import Array, Float, PRNGKeyArray, Scalar
+from jaxtyping import Array, Bool, Float, PRNGKeyArray, Scalar
 
 from dtprob.errors import InputError
+from dtprob.inference import von_mises
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
 from dtprob.inference.coupling import angle_sites
@@ -31,10 +31,10 @@ from dtprob.inference.engine import (
     check_counts,
     check_key,
 )
+from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.optimise import minimise
 from dtprob.inference.phasors import is_gaussian, least_squares_start
 from dtprob.inference.posterior import Posterior
-from dtprob.inference.progress import Progress
 from dtprob.inference.relaxation import (
     Layout,
     Quadratic,
@@ -47,7 +47,6 @@ from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model
 
 _SWEEPS = 1000
-_SMALLEST, _LARGEST = 1e-8, 1e6
 
 
 class VonMises(NamedTuple):
@@ -73,11 +72,8 @@ class VonMises(NamedTuple):
         return jnp.log(2 * jnp.pi * i0e(kappa)) + kappa * (1 - i1e(kappa) / i0e(kappa))
 
     def sample(self, key: PRNGKeyArray, n: int) -> Float[Array, "draw group colour"]:
-        """`n` draws; above a concentration of a million a normal, which then differs by less than 1e-6."""
-        shape = (n, *self.direction.shape)
-        normal = jax.random.normal(key, shape) / jnp.sqrt(jnp.maximum(self.concentration, _LARGEST))
-        spread = dist.VonMises(0.0, jnp.clip(self.concentration, _SMALLEST, _LARGEST)).sample(key, (n,))
-        return self.direction + jnp.where(self.concentration > _LARGEST, normal, spread)
+        """`n` draws."""
+        return von_mises.sample(key, self.direction, self.concentration, n)
 
 
 class Stage(NamedTuple):
@@ -92,6 +88,20 @@ class Stage(NamedTuple):
     angles: VonMises
     rest: Float[Array, " dimension"]
     free_energy: Scalar
+
+
+class Settling(NamedTuple):
+    """The state of a run.
+
+    Attributes:
+        stage: where it is.
+        first: the free energy before the first iteration, nats.
+        converged: whether an E-step from fresh starts brought nothing more.
+    """
+
+    stage: Stage
+    first: Scalar
+    converged: Bool[Array, ""]
 
 
 @dataclass(frozen=True)
@@ -140,9 +150,12 @@ class VonMisesEM(AbstractEngine):
             remedy = "Sample the phases from VonMises, or use another engine"
             raise InputError(f"von_mises_em on model {target.declaration.name}", expected, "none", remedy)
         layout = find_layout(target, inputs, layout_key)
-        stage, history, converged = self._alternate(target, inputs, layout, options)
+        job = Job(self, target, inputs, key, options, free=("draws",))
+        settling, history = iterate(job, self._steps(target, inputs, layout))
+        stage = settling.stage
         angles = jax.vmap(layout.flat)(stage.angles.sample(draw_key, self.draws))
         positions = jnp.tile(stage.rest, (self.draws, 1)).at[:, target.angles].set(angles)
+        energies = np.concatenate([[settling.first], history["free_energy"].ravel()])
         return assemble(
             target,
             inputs,
@@ -151,30 +164,37 @@ class VonMisesEM(AbstractEngine):
             key=key,
             options=options,
             extra=_facts(target, inputs, layout, stage)
-            | {"free_energy_history": np.asarray(history), "converged": converged},
+            | {"free_energy_history": energies[np.isfinite(energies)], "converged": settling.converged},
         )
 
-    def _alternate(
-        self, target: Target, inputs: Inputs, layout: Layout, options: RunOptions
-    ) -> tuple[Stage, list[float], bool]:
-        """The last stage, the free energy after each iteration, and whether it settled."""
-        values = target.latent_values(self.initial or {})
-        rest = target.compiled(Target.prior_median)(inputs, values)
-        nothing = jnp.zeros(layout.table.shape, rest.dtype)
-        stage = self._restart(target, layout, VonMises(nothing, nothing), rest, inputs)
-        history = [float(stage.free_energy)]
-        with Progress(self.name, self.max_iterations, options.progress, options.status_file) as progress:
-            for iteration in range(self.max_iterations):
-                stage = _refine(target, layout, stage, self.newton_steps, inputs)
-                settled = history[-1] - float(stage.free_energy) < self.tolerance
-                history.append(float(stage.free_energy))
-                if settled:
-                    stage = self._restart(target, layout, stage.angles, stage.rest, inputs)
-                    history.append(float(stage.free_energy))
-                    if history[-2] - history[-1] < self.tolerance:
-                        return stage, history, True
-                progress.report(iteration + 1, "iterations", f"free energy {history[-1]:.6g} nats")
-        return stage, history, False
+    def _steps(self, target: Target, inputs: Inputs, layout: Layout) -> Steps[Settling]:
+        """An iteration is an M- and an E-step; once they have settled, also the E-step afresh."""
+
+        def begin() -> Settling:
+            values = target.latent_values(self.initial or {})
+            rest = target.compiled(Target.prior_median)(inputs, values)
+            nothing = jnp.zeros(layout.table.shape, rest.dtype)
+            stage = self._restart(target, layout, VonMises(nothing, nothing), rest, inputs)
+            return Settling(stage, stage.free_energy, jnp.zeros((), dtype=bool))
+
+        def step(_: int, before: Settling) -> tuple[Settling, dict[str, Any]]:
+            stage = _refine(target, layout, before.stage, self.newton_steps, inputs)
+            refined, again = stage.free_energy, jnp.full_like(stage.free_energy, jnp.nan)
+            if before.stage.free_energy - refined >= self.tolerance:
+                return before._replace(stage=stage), {"free_energy": jnp.stack([refined, again])}
+            stage = self._restart(target, layout, stage.angles, stage.rest, inputs)
+            converged = refined - stage.free_energy < self.tolerance
+            row = {"free_energy": jnp.stack([refined, stage.free_energy])}
+            return Settling(stage, before.first, converged), row
+
+        return Steps(
+            begin,
+            step,
+            finished=lambda settling: bool(settling.converged),
+            most=self.max_iterations,
+            phase="iterations",
+            note=lambda settling: f"free energy {float(settling.stage.free_energy):.6g} nats",
+        )
 
     def _restart(
         self, target: Target, layout: Layout, angles: VonMises, rest: Array, inputs: Inputs

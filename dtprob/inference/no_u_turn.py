@@ -1,0 +1,59 @@
+"""What the No-U-Turn samplers have in common: their settings, and the run."""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import jax
+
+from dtprob.inference.chains import ChainMethod
+from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions
+from dtprob.inference.kernel import Kernel
+from dtprob.inference.posterior import Posterior
+from dtprob.inference.run import Schedule, run_chains
+from dtprob.models.declaration import Model
+
+
+@dataclass(frozen=True)
+class AbstractNoUTurn(AbstractEngine):
+    """A No-U-Turn sampler with windowed adaptation.
+
+    A draw depends on the key, its chain and its place in the chain; not on chunks, interruptions, or how many
+    chains or draws there are. Angles do not get stuck at +-pi; see `dtprob.inference.winding`.
+
+    Attributes:
+        draws: draws of each chain.
+        warmup: steps of each chain before them, in which it adapts.
+        chains: how many chains.
+        target_accept: acceptance rate that the step size is adapted to.
+        max_tree_depth: bound on the doublings of a trajectory.
+        dense_mass: adapt a full mass matrix rather than a diagonal one.
+        chain_method: "sequential" or "vectorized": chains one after the other, or side by side, which is
+            faster on a GPU but makes the last bits of a draw depend on the number of chains.
+        initial: constrained values that every chain starts from; sites without one start from the prior.
+    """
+
+    answer: ClassVar[Answer] = "exact"
+
+    draws: int = 1000
+    warmup: int = 1000
+    chains: int = 4
+    target_accept: float = 0.8
+    max_tree_depth: int = 10
+    dense_mass: bool = False
+    chain_method: ChainMethod = "sequential"
+    initial: Mapping[str, Any] | None = None
+
+    @abc.abstractmethod
+    def kernel(self, warmup: int) -> Kernel:
+        """The transition, which adapts itself in the first `warmup` steps."""
+
+    def __call__(
+        self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
+    ) -> Posterior:
+        """Infer; see `AbstractEngine`."""
+        schedule = Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial)
+        return run_chains(self, self.kernel, schedule, key, model=model, data=data, options=options)
