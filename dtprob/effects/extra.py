@@ -25,6 +25,7 @@ from dtprob.effects.common import (
     half_normal,
     has_phase,
     meets,
+    n_antenna,
     normal,
     offers,
     phasor,
@@ -112,30 +113,51 @@ def diffuse_scattering(sites: Sites, data: Data) -> list[Effect]:
     weight = np.exp(-step * np.arange(taps) / (2 * decay))
     weight = weight / np.linalg.norm(weight)
 
-    def fill(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        paths = context["paths"]
-        first = jnp.min(jnp.where(paths.mask, paths.delay, jnp.inf), axis=1)
-        first = jnp.where(jnp.isfinite(first), first, 0.0)
-        delay = first[:, None] + step * jnp.arange(taps)
-        tone = phasor(-2 * jnp.pi * delay[..., None] * jnp.asarray(context["subcarrier_frequency"]))
-        waves = complex_of(p[FIELD])[:, :, :, :, 0] * jnp.asarray(weight)
-        loss = jnp.sqrt(jnp.sum(_free_space(paths) ** 2, axis=1))[:, None, None, None, None]
-        tail = jnp.einsum("lsrtm,lmk->lsrtk", waves, tone) / jnp.sqrt(2.0)
-        return value + p["scale"] * loss * tail * _shared(context)
+    def tail(near: str | None) -> Effect:
+        def fill(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+            paths = context["paths"]
+            first = jnp.min(jnp.where(paths.mask, paths.delay, jnp.inf), axis=1)
+            first = jnp.where(jnp.isfinite(first), first, 0.0)
+            delay = first[:, None] + step * jnp.arange(taps)
+            tone = phasor(-2 * jnp.pi * delay[..., None] * jnp.asarray(context["subcarrier_frequency"]))
+            waves = complex_of(p[FIELD])[:, :, :, :, 0] * jnp.asarray(weight)
+            loss = jnp.sqrt(jnp.sum(_free_space(paths) ** 2, axis=1))[:, None, None, None, None]
+            waves = waves * _towards(context, near)
+            rest = jnp.einsum("lsrtm,lmk->lsrtk", waves, tone) / jnp.sqrt(2.0)
+            return value + p["scale"] * loss * rest * _shared(context)
 
-    return [
-        Effect(
+        def shape(value: Any, _: Any) -> tuple[int, ...]:
+            receive = 1 if near == "transmitter" else value.shape[2]
+            transmit = 1 if near == "receiver" else value.shape[3]
+            return (value.shape[0], 1, receive, transmit, 1, taps, 2)
+
+        where = "white over antennas" if near is None else f"off scatterers around the {near}"
+        return Effect(
             "diffuse_scattering",
             {"noiseless_channel": fill},
             (half_normal("scale", 0.2),),
+            instance=None if near is None else f"near_{near}",
             kind="variance",
-            physics="Dense multipath from the first arrival on, exponential in delay, white over antennas;"
+            physics=f"Dense multipath from the first arrival on, exponential in delay, {where};"
             " its rms is the size times that of all paths in free space.",
             source="Richter, Estimation of Radio Channel Parameters, TU Ilmenau 2005, ch. 2.",
             requires=_NEEDS,
-            field_shape=lambda value, _: (value.shape[0], 1, value.shape[2], value.shape[3], 1, taps, 2),
+            field_shape=shape,
         )
-    ]
+
+    antennas = {"receiver": n_antenna(sites, "tx"), "transmitter": n_antenna(sites, "rx")}
+    return [tail(None), *(tail(near) for near, count in antennas.items() if count > 1)]
+
+
+def _towards(context: Mapping[str, Any], near: str | None) -> jax.Array:
+    """Response, (link, 1, rx_antenna, tx_antenna, 1), of the array that sees scatterers at the other end as one point."""
+    paths = context["paths"]
+    direction, _ = _leg(paths.tx_position, paths.rx_position)
+    if near == "receiver":
+        return _response(context, "tx_array", direction, 1.0)[:, None, None, :, None]
+    if near == "transmitter":
+        return _response(context, "rx_array", direction, -1.0)[:, None, :, None, None]
+    return jnp.ones((1, 1, 1, 1, 1))
 
 
 def _sums_paths(sites: Sites) -> bool:

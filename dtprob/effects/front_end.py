@@ -31,8 +31,8 @@ from dtprob.effects.common import (
 )
 from dtprob.effects.effect import FIELD, Effect
 
-_RIPPLES: Final = (2, 3, 4, 6, 8)
-"""Cycles of a ripple over the band."""
+_RIPPLES: Final = np.arange(1.5, 16.25, 0.5)
+"""Cycles of a ripple over the band: an echo between two of them loses a fifth of its power at most."""
 
 
 def timing_offset(sites: Sites, data: Data) -> list[Effect]:
@@ -142,11 +142,11 @@ def frequency_ripple(sites: Sites, data: Data) -> list[Effect]:
     if measured is None or not has_phase(sites) or not offers(sites, "frequency_response"):
         return []
     effects = []
-    for cycles in _RIPPLES:
+    for cycles in _RIPPLES.tolist():
         if measured.size <= 2 * cycles:
             continue
 
-        def echo(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], cycles: int = cycles) -> Any:
+        def echo(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], cycles: float = cycles) -> Any:
             turn = jnp.pi * cycles * measured.position(context["subcarrier_frequency"])
             return value * (1.0 + complex_of(p["echo"]) * phasor(-turn))
 
@@ -155,8 +155,8 @@ def frequency_ripple(sites: Sites, data: Data) -> list[Effect]:
                 "frequency_ripple",
                 {"frequency_response": echo},
                 (normal("echo", 0.05, "1", 2),),
-                instance=f"{cycles}_cycles",
-                physics=f"An echo {cycles / measured.width:.3g} s late, {cycles} cycles over the band.",
+                instance=f"{cycles:g}_cycles",
+                physics=f"An echo {cycles / measured.width:.3g} s late, {cycles:g} cycles over the band.",
                 source="1 + g exp(-j 2 pi f_k m / B), g complex (real, imaginary).",
                 requires=("subcarrier_frequency",),
             )

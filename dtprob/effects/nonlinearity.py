@@ -32,19 +32,18 @@ _SALEH: Final = (
 
 def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
     """A memoryless amplifier compresses strong signals and turns their phase."""
-    power = reference_power(data)
-    if power is None or not has_phase(sites):
+    if data.get("channel") is None or not has_phase(sites):
         return []
 
-    def compress(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-        return value / (1.0 + p["compression"] * square(value) / power)
+    def compress(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        return value / (1.0 + p["compression"] * square(value) / reference_power(context))
 
-    def compress_all(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-        level = jnp.mean(square(value), axis=-1, keepdims=True) / power
+    def compress_all(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        level = jnp.mean(square(value), axis=-1, keepdims=True) / reference_power(context)
         return value / (1.0 + p["compression"] * level)
 
-    def turn(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-        level = square(value) / power
+    def turn(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        level = square(value) / reference_power(context)
         return value * phasor(p["phase"] * level / (1.0 + level))
 
     compression = (half_normal("compression", 0.1),)
@@ -55,6 +54,7 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
             compression,
             physics="Gain falls with the power of the entry: one tone at a time. Unit: the mean power.",
             source="h / (1 + c |h|^2 / P): " + _SALEH,
+            requires=("channel",),
         ),
         Effect(
             "amplifier_nonlinearity",
@@ -63,6 +63,7 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
             instance="phase",
             physics="Phase turns with the power of the entry; size is the turn far above the mean power.",
             source="h exp(j a x / (1 + x)), x = |h|^2 / P: " + _SALEH,
+            requires=("channel",),
         ),
     ]
     if band(data) is not None:
@@ -73,6 +74,7 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
             instance="wideband",
             physics="Gain falls with the power over the whole band: all subcarriers at a time.",
             source="h / (1 + c mean_k |h|^2 / P): " + _SALEH,
+            requires=("channel",),
         )
         effects.append(wideband)
     return effects
@@ -80,17 +82,21 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
 
 def crosstalk(sites: Sites, data: Data) -> list[Effect]:
     """A constant leaks inside the instrument, on all subcarriers or on the one at the carrier."""
-    power, measured = reference_power(data), band(data)
-    if power is None or not has_phase(sites):
+    measured = band(data)
+    if data.get("channel") is None or not has_phase(sites):
         return []
-    level = float(np.sqrt(power))
+
+    def leak(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        return value + jnp.sqrt(reference_power(context)) * complex_of(p["leak"])
+
     effects = [
         Effect(
             "crosstalk",
-            {"noiseless_channel": lambda value, p, _: value + level * complex_of(p["leak"])},
+            {"noiseless_channel": leak},
             (normal("leak", 0.1, "1", 2),),
             physics="The same complex number is added to every entry; unit: the rms channel.",
             source="h + g sqrt(P), g complex (real, imaginary).",
+            requires=("channel",),
         )
     ]
     frequency = np.asarray(data["subcarrier_frequency"], dtype=float)
@@ -100,7 +106,7 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
     def offset(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
         distance = jnp.abs(jnp.asarray(context["subcarrier_frequency"]))
         centre = on_axis(distance == jnp.min(distance), "subcarrier", CHANNEL_AXES)
-        return value + jnp.where(centre, level * complex_of(p["leak"]), 0.0)
+        return jnp.where(centre, leak(value, p, context), value)
 
     centre = Effect(
         "crosstalk",
@@ -109,7 +115,7 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
         instance="carrier",
         physics="Leaking local oscillator: a complex number is added to the subcarrier at the carrier.",
         source="h_0 + g sqrt(P), g complex (real, imaginary).",
-        requires=("subcarrier_frequency",),
+        requires=("channel", "subcarrier_frequency"),
     )
     return [*effects, centre]
 

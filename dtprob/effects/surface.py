@@ -57,7 +57,7 @@ def material_mismatch(sites: Sites, data: Data) -> list[Effect]:
 
 def thickness_mismatch(sites: Sites, data: Data) -> list[Effect]:
     """One wall is thicker or thinner than the twin takes it for."""
-    if not offers(sites, "thickness"):
+    if not offers(sites, "thickness") or data.get("law") == "half_space":
         return []
 
     def shift(index: int) -> Rewrite:

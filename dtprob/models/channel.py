@@ -23,7 +23,7 @@ from dtprob.models.scene import (
     channel_shape,
     observe,
     site,
-    unknown_materials,
+    traced_gain,
     unknown_noise_power,
     unknown_phase,
 )
@@ -152,10 +152,7 @@ def _channel(
     shape: tuple[int, int, int, int, int],
     phase_error: Any,
 ) -> jax.Array:
-    permittivity, conductivity = unknown_materials(paths, materials)
-    permittivity = site("permittivity", permittivity)
-    conductivity = site("conductivity", conductivity)
-    gain = site("path_gain", field.path_gain(paths, permittivity, conductivity, law=law))
+    gain = traced_gain(paths, materials, law)
     delay = site("path_delay", paths.delay)
     departure = site("departure", paths.departure)
     arrival = site("arrival", paths.arrival)

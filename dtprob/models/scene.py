@@ -15,6 +15,7 @@ from dtprob.errors import InputError
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.raytracing import field
 from dtprob.raytracing.paths import PathSet
+from dtprob.raytracing.slab import Law
 
 type Materials = Literal["per_material", "per_object", "shared", "known"]
 """Which permittivities and conductivities are unknown."""
@@ -23,6 +24,7 @@ CHANNEL_AXES = ("link", "snapshot", "rx_antenna", "tx_antenna", "subcarrier")
 AXES = {
     "permittivity": ("object",),
     "conductivity": ("object",),
+    "thickness": ("object",),
     "path_gain": ("link", "path"),
     "path_delay": ("link", "path"),
     "departure": ("link", "path", "direction"),
@@ -92,6 +94,23 @@ def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, 
             "material_conductivity", dist.LogNormal(jnp.log(jnp.maximum(nominal_conductivity, 1e-4)), 1.0)
         )
     return material_permittivity[index], material_conductivity[index]
+
+
+def traced_gain(
+    paths: PathSet, materials: Materials, law: Law
+) -> Complex[Array, "link path"]:
+    """The site `path_gain` and, before it, those of what the objects are made of.
+
+    Args:
+        paths: propagation paths of each link.
+        materials: which permittivities and conductivities are unknown.
+        law: "slab" (finite thickness) or "half_space".
+    """
+    permittivity, conductivity = unknown_materials(paths, materials)
+    permittivity = site("permittivity", permittivity)
+    conductivity = site("conductivity", conductivity)
+    thickness = site("thickness", jnp.asarray(paths.thickness))
+    return site("path_gain", field.path_gain(paths, permittivity, conductivity, thickness=thickness, law=law))
 
 
 def unknown_phase() -> dist.VonMises:

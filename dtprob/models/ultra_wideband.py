@@ -28,7 +28,7 @@ from dtprob.models.scene import (
     channel_shape,
     observe,
     site,
-    unknown_materials,
+    traced_gain,
     unknown_noise_power,
     unknown_phase,
 )
@@ -37,7 +37,7 @@ from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.phasor import phasor
 from dtprob.raytracing.slab import Law
 
-_AXES: Final = AXES | {"thickness": ("object",), "receiver_gain": ("link",), "receiver_delay": ("link",)}
+_AXES: Final = AXES | {"receiver_gain": ("link",), "receiver_delay": ("link",)}
 _LOG_GAINS: Final = range(1, 9)
 _PHASES: Final = range(2, 9)
 _DELAY_SPREAD: Final = 0.5e-9
@@ -108,7 +108,7 @@ def ultra_wideband_channel(
     if phase != "per_packet":
         raise InputError("phase", "per_packet", repr(phase), 'Set phase = "per_packet" in [data]')
     shape = channel_shape(paths, subcarrier_frequency, channel=channel)
-    room = _room(paths, materials, law)
+    room = traced_gain(paths, materials, law)
     receiver = _receiver(shape[0], rough_delay)
     noiseless = _received(paths, subcarrier_frequency, room, receiver)
     noise = site("noise_power", _variance(paths, noise_power, link_power, model_error, shape[1]))
@@ -154,16 +154,6 @@ def _variance(
         return unknown_noise_power(None, paths)
     error = 0.0 if link_power is None else snapshots * model_error * link_power
     return jnp.broadcast_to(noise_power + error, (paths.n_link,)).reshape((-1, 1, 1, 1, 1))
-
-
-def _room(paths: PathSet, materials: Materials, law: Law) -> jax.Array:
-    """Gain of every path, (link, path)."""
-    permittivity, conductivity = unknown_materials(paths, materials)
-    eps = site("permittivity", permittivity)
-    sigma = site("conductivity", conductivity)
-    thickness = site("thickness", jnp.asarray(paths.thickness))
-    gain = field.path_gain(paths, eps, sigma, thickness=thickness, law=law)
-    return site("path_gain", gain)
 
 
 def _receiver(links: int, rough: jax.Array | None) -> _Receiver:
