@@ -7,7 +7,7 @@ plus the prior's, so the log evidence (Laplace) and the marginal log likelihood 
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -24,8 +24,14 @@ _TRIES: Final = 8
 _SETTLED: Final = 0.01
 """Change of the logarithm of a field's standard deviation below which it stands."""
 _FEWEST, _FAINTEST = 0.5, 1e-9
+_LONGEST: Final = float(np.log(3.0))
+_LEAST_DAMPING: Final = 1e-12
 _STUCK: Final = 1e3
 """Damping beyond which a fit has arrived, whatever its quadratic promises."""
+
+
+type Changes = Mapping[str, float]
+"""The last change of the logarithm of each field's standard deviation; empty after one that was extrapolated."""
 
 
 @dataclass(frozen=True)
@@ -120,16 +126,17 @@ def fit(
     active = activate(problem, effects, weights, spread)
     x, damping, converged = np.array(x, float), 1e-3, False
     value = _weighted(active, _objective(problem, active, x))
+    latest: Changes = {}
     for _ in range(steps):
         system = _system(problem, active, x)
         trial = _better(problem, active, system, x, value=value, damping=damping, tolerance=tolerance)
         better = trial.value > value
         converged = trial.gain < tolerance or (not better and trial.damping > _STUCK)
         if better:
-            x, value, damping = trial.x, trial.value, trial.damping / 8
+            x, value, damping = trial.x, trial.value, max(trial.damping / 8, _LEAST_DAMPING)
         change = 0.0
         if active.spread:
-            active, change = _respread(problem, active, x, system)
+            active, change, latest = _respread(problem, active, x, system, latest)
             value = _weighted(active, _objective(problem, active, x))
         converged = converged and change < _SETTLED
         if converged or not (better or change >= _SETTLED):
@@ -190,13 +197,17 @@ def _lowest(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     return lowest[active.global_index]
 
 
-def _respread(problem: Problem, active: Active, x: np.ndarray, system: System) -> tuple[Active, float]:
-    """New standard deviations of variance effects, and the largest change of their logarithms.
+def _respread(
+    problem: Problem, active: Active, x: np.ndarray, system: System, latest: Changes
+) -> tuple[Active, float, Changes]:
+    """New standard deviations of variance effects, the largest change of their logarithms, and the next `latest`.
 
     sd^2 <- sum x^2 / gamma, gamma = sum (1 - var / sd^2) the number of entries that the data determine (MacKay, Neural
-    Computation 4 (1992) 415): the same fixed point as EM, reached in fewer steps; no step is longer than a factor of 3.
+    Computation 4 (1992) 415): the same fixed point as EM, reached in fewer steps. Where a field is weak these steps
+    shrink slowly, so every second one is extrapolated to the limit of a geometric series (Aitken). No step is longer
+    than a factor of 3.
     """
-    spread, change = dict(active.spread), 0.0
+    spread, changes = dict(active.spread), dict[str, float]()
     own = np.zeros(problem.dimension)
     own[active.global_index] = np.diag(np.linalg.inv(positive(system.curvature)))
     if active.local_index.size:
@@ -206,11 +217,13 @@ def _respread(problem: Problem, active: Active, x: np.ndarray, system: System) -
         kept = [b.index[active.weights > 0] if b.local else b.index for b in blocks]
         index = np.concatenate([i.reshape(-1) for i in kept])
         determined = max(float(np.sum(1 - own[index] / sd**2)), _FEWEST)
-        ratio = np.sqrt(np.sum(x[index] ** 2) / determined) / sd
-        ratio = float(np.clip(ratio, 1 / 3, 3.0))
-        spread[name] = max(sd * ratio, _FAINTEST)
-        change = max(change, abs(np.log(spread[name] / sd)))
-    return replace(active, spread=spread), change
+        step = float(np.log(np.sqrt(np.sum(x[index] ** 2) / determined) / sd + 1e-300))
+        shrink = step / latest[name] if latest.get(name) else 0.0
+        step = step / (1 - shrink) if 0 < shrink < 1 else step
+        spread[name] = max(sd * float(np.exp(np.clip(step, -_LONGEST, _LONGEST))), _FAINTEST)
+        changes[name] = float(np.log(spread[name] / sd))
+    change = max(abs(c) for c in changes.values())
+    return replace(active, spread=spread), change, {} if latest else changes
 
 
 def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, converged: bool) -> Fit:

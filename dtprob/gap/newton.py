@@ -12,6 +12,9 @@ from scipy import linalg
 _EDGES: Final = 8
 """Times that more coordinates are put on their edge before the others' step is taken as it is."""
 
+_SAFE: Final = 1e-5
+"""Smallest diagonal of a Cholesky factor at which a scaled curvature is taken as it is."""
+
 
 @dataclass(frozen=True)
 class System:
@@ -49,9 +52,21 @@ def positive(matrix: np.ndarray) -> np.ndarray:
     symmetric = (matrix + np.swapaxes(matrix, -1, -2)) / 2
     size = np.sqrt(np.maximum(np.abs(np.einsum("...ii->...i", symmetric)), 1e-300))
     outer = size[..., :, None] * size[..., None, :]
-    values, vectors = np.linalg.eigh(symmetric / outer)
+    scaled = symmetric / outer
+    if _is_positive(scaled):
+        return symmetric
+    values, vectors = np.linalg.eigh(scaled)
     values = np.maximum(np.abs(values), 1e-12)
     return np.einsum("...ij,...j,...kj->...ik", vectors, values, vectors) * outer
+
+
+def _is_positive(scaled: np.ndarray) -> bool:
+    """Whether matrices of unit diagonal are safely positive, found at a tenth of the cost of their eigenvalues."""
+    try:
+        factor = np.linalg.cholesky(scaled)
+    except np.linalg.LinAlgError:
+        return False
+    return bool(np.einsum("...ii->...i", factor).min() > _SAFE)
 
 
 def local_step(system: System, damping: float) -> NewtonStep:

@@ -24,7 +24,7 @@ from dtprob.gap.where import Location, locate
 
 type Say = Callable[[str], None]
 
-_LARGEST_FIELD = 96
+_LARGEST_FIELD = 256
 """Entries of a field per cluster up to which it is fitted entry by entry."""
 _LARGEST_TANGENTS = 100_000_000
 """Numbers that the tangents of a field may take: 0.8 GB."""
