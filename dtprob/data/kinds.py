@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
 
 from dtprob.data.arrays import ArraySpec, check_arrays, check_finite
+from dtprob.data.network_rows import check_rows
 from dtprob.errors import InputError
 
 _POSITIONS = {
@@ -155,8 +156,8 @@ class NetworkLog(_Checked):
         arrival: 1 where a packet was generated at the end of the slot.
 
     Raises:
-        InputError: arrays that do not fit together, an action, ack or arrival other than 0 and 1, a slot that
-            stands twice in an episode.
+        InputError: arrays that do not fit together, an action, ack or arrival other than 0 and 1, or rows that
+            cannot be or cannot follow one another; see `dtprob.data.network_rows.check_rows`.
     """
 
     episode: Int[np.ndarray, " row"]
@@ -168,21 +169,12 @@ class NetworkLog(_Checked):
 
     def __post_init__(self) -> None:
         self._check(NETWORK_ARRAYS)
-        for name in ("action", "ack", "arrival"):
-            if (highest := getattr(self, name).max()) > 1:
-                raise InputError(name, "0 or 1", str(highest), f"Give {name} as 0 or 1 per device and slot")
         order = np.lexsort((self.slot, self.episode))
         for field in fields(self):
             array = getattr(self, field.name)[order]
             array.setflags(write=False)
             object.__setattr__(self, field.name, array)
-        same = (np.diff(self.episode) == 0) & (np.diff(self.slot) == 0)
-        if same.any():
-            row = int(np.argmax(same))
-            got = f"slot {self.slot[row]} of episode {self.episode[row]} twice"
-            raise InputError(
-                "slot", "each slot of an episode once", got, "Number the slots within each episode"
-            )
+        check_rows(self, order)
 
 
 @final

@@ -2,31 +2,26 @@
 
 import os
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from dtprob.data import uwb_apartment
+from dtprob.data import network, uwb_apartment
 from dtprob.data.arrays import ArraySpec
 from dtprob.data.formats import Arrays, load_arrays
 from dtprob.data.kinds import (
     CHANNEL_ARRAYS,
     LABEL_ARRAYS,
-    NETWORK_ARRAYS,
     POWER_ARRAYS,
     ChannelData,
     Data,
     Labels,
-    NetworkLog,
     PowerData,
     Table,
 )
 from dtprob.errors import InputError, unknown_name
-
-_DEVICE_COLUMNS = ("buffer", "action", "ack", "arrival")
-_NUMBERED = re.compile(r"(.+)_(\d+)")
 
 
 def read(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None) -> Data:
@@ -39,7 +34,8 @@ def read(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None)
     Args:
         path: an .npz, .h5, .hdf5, .nc, .zarr, .mat, .csv or .parquet file, or the folder of the measured set
             ``uwb_apartment`` (read by ``dtprob.data.uwb_apartment.channels``).
-        options: settings of the reader; only the measured set has some: ``links``, ``averages``, ``level``.
+        options: settings of the reader; the measured set has ``links``, ``averages``, ``level``, network logs
+            have ``allow_gaps``, which splits episodes where slots are missing.
 
     Raises:
         InputError: no such file, a format that is not read, a file that holds Python objects, or arrays that
@@ -48,11 +44,10 @@ def read(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None)
     path = Path(path)
     if (path / uwb_apartment.RESPONSES).is_file():
         return uwb_apartment.channels(path, **_known(options or {}, ("links", "averages", "level"), path))
-    _known(options or {}, (), path)
     arrays = load_arrays(path)
-    matlab = path.suffix.lower() == ".mat"
+    chosen = _known(options or {}, ("allow_gaps",) if _is_log(arrays) else (), path)
     try:
-        return _interpret(arrays, matlab=matlab)
+        return _interpret(arrays, chosen, matlab=path.suffix.lower() == ".mat")
     except InputError as error:
         raise InputError(f"{path.name}: {error.what}", error.expected, error.got, error.remedy) from None
 
@@ -83,14 +78,20 @@ def read_table(path: str | os.PathLike[str]) -> Table:
         raise InputError(f"{path.name}: {error.what}", error.expected, error.got, error.remedy) from None
 
 
-def _interpret(arrays: Arrays, *, matlab: bool) -> Data:
+def _is_log(names: Iterable[str]) -> bool:
+    return not {"channel", "power", "power_db"} & set(names) and bool(
+        {"episode", "slot", "buffer_0"} & set(names)
+    )
+
+
+def _interpret(arrays: Arrays, options: Mapping[str, Any], *, matlab: bool) -> Data:
     names = set(arrays)
     if "channel" in names:
         return _channels(arrays, matlab=matlab)
     if names & {"power", "power_db"}:
         return _powers(arrays, matlab=matlab)
-    if names & {"episode", "slot", "buffer_0"}:
-        return _network_log(arrays)
+    if _is_log(names):
+        return network.from_columns(arrays, **options)
     if "y" in names and names & {"x", "x_0"}:
         return _labels(arrays, matlab=matlab)
     if names & set(CHANNEL_ARRAYS):
@@ -139,28 +140,6 @@ def _numeric(name: str, array: np.ndarray) -> None:
         raise InputError(
             name, "real numbers", f"values of type {array.dtype}", f"Store {name} as real numbers"
         )
-
-
-def _network_log(arrays: Arrays) -> NetworkLog:
-    columns = [name for name in arrays if name not in {"episode", "slot"}]
-    devices = 0
-    for name in columns:
-        match = _NUMBERED.fullmatch(name)
-        if match is None or match.group(1) not in _DEVICE_COLUMNS:
-            valid = ["episode", "slot", *(f"{column}_0" for column in _DEVICE_COLUMNS)]
-            raise unknown_name("column", name, valid, "column name")
-        devices = max(devices, int(match.group(2)) + 1)
-    logged = {name: arrays[name] for name in ("episode", "slot") if name in arrays}
-    for column in _DEVICE_COLUMNS:
-        for device in range(max(devices, 1)):
-            if f"{column}_{device}" not in arrays:
-                remedy = "Give every device from 0 its four columns"
-                raise InputError(f"{column}_{device}", "a column", "nothing", remedy)
-        logged[column] = np.stack([arrays[f"{column}_{device}"] for device in range(devices)], axis=1)
-    for name in ("episode", "slot"):
-        if name not in logged:
-            raise InputError(name, "a column", "nothing", "Number the episodes and their slots from 0")
-    return NetworkLog(**_canonical(logged, NETWORK_ARRAYS, matlab=False))
 
 
 def _labels(arrays: Arrays, *, matlab: bool) -> Labels:

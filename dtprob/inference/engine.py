@@ -15,7 +15,7 @@ from dtprob.inference.posterior import Posterior
 from dtprob.models.declaration import Model
 
 type Answer = Literal["exact", "approximation", "point"]
-type Serves = Literal["continuous", "circular"]
+type Serves = Literal["continuous", "circular", "tables"]
 
 
 @dataclass(frozen=True)
@@ -66,7 +66,7 @@ class AbstractEngine(abc.ABC):
         answer: "exact" when its draws come from the posterior, "approximation" when from a stand-in, "point"
             when there is a single value.
         serves: "continuous" for any model with continuous latent sites, "circular" where it needs circular
-            ones.
+            ones, "tables" where every latent site is a `LogDirichlet` table.
     """
 
     name: ClassVar[str]

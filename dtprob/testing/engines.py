@@ -12,11 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from scipy import special
 
 from dtprob.errors import InputError
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.complex_normal import ComplexNormal
+from dtprob.models.dirichlet import LogDirichlet
 from dtprob.testing.contract import expect, same
 
 _UNITS, _ROWS, _OBSERVED = 3, 8, "y"
@@ -52,7 +54,7 @@ def check_engine(engine: AbstractEngine, *, key: jax.Array | None = None) -> Non
     """
     key = jax.random.key(0) if key is None else key
     what = f"engine {engine.name}"
-    case = _circular_case() if engine.serves == "circular" else _normal_case()
+    case = {"circular": _circular_case, "tables": _table_case, "continuous": _normal_case}[engine.serves]()
     posterior = engine(key, case.model, case.data)
     _check_layout(what, posterior, case)
     _check_keys(what, engine, case, posterior, key)
@@ -97,6 +99,24 @@ def _circular_case() -> _Case:
     return _Case(
         _phasor, {"noise": 4.0, _OBSERVED: y}, "phase", np.stack([length.real, length.imag]), direction
     )
+
+
+def _coins(concentration: float, y: Any = None) -> None:
+    allowed = np.ones((_UNITS, 2), dtype=bool)
+    table = jnp.asarray(numpyro.sample("table", LogDirichlet(concentration, allowed)))
+    level = numpyro.deterministic("level", table[:, 1])
+    numpyro.deterministic("doubled", 2 * jnp.asarray(level))
+    with numpyro.plate("row", _ROWS, dim=-2), numpyro.plate("unit", _UNITS, dim=-1):
+        numpyro.sample(_OBSERVED, dist.Categorical(logits=table), obs=y)
+
+
+def _table_case() -> _Case:
+    y = np.random.default_rng(0).integers(0, 2, (_ROWS, _UNITS))
+    heads, total = 0.5 + y.sum(0), 1.0 + _ROWS
+    mean = special.digamma(heads) - special.digamma(total)
+    variance = special.polygamma(1, heads) - special.polygamma(1, total)
+    moments = np.stack([mean, mean**2 + variance])
+    return _Case(_coins, {"concentration": 0.5, _OBSERVED: y}, "level", moments, mean)
 
 
 def _features(case: _Case, values: np.ndarray) -> np.ndarray:

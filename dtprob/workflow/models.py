@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtprob.data import ChannelData
+from dtprob.data import ChannelData, NetworkLog
 from dtprob.models.declaration import Model
 
 
@@ -17,11 +17,14 @@ class Entry:
         function: where it is, "module:function".
         data: the kind of data it explains.
         derived: arguments that are computed from the others, each by a function of them, "module:function".
+        arrange: for data that are no arguments as they are, the function "module:function" from the data, and
+            options by name, to the arguments; its options can stand in [model.options] beside the model's.
     """
 
     function: str
     data: type
     derived: Mapping[str, str] = field(default_factory=dict)
+    arrange: str | None = None
 
     def load(self) -> Model:
         """The model itself."""
@@ -30,6 +33,10 @@ class Entry:
     def derive(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """The arguments that are computed from the others."""
         return {name: _load(function)(arguments) for name, function in self.derived.items()}
+
+    def arranger(self) -> Callable[..., dict[str, Any]] | None:
+        """The function from data to arguments, if there is one."""
+        return None if self.arrange is None else _load(self.arrange)
 
 
 def _load(function: str) -> Callable[..., Any]:
@@ -44,6 +51,9 @@ MODELS: Mapping[str, Entry] = {
         "dtprob.models.ultra_wideband:ultra_wideband_channel",
         ChannelData,
         {name: f"dtprob.models.ultra_wideband:{name}" for name in ("rough_delay", "link_power")},
+    ),
+    "multi_access": Entry(
+        "dtprob.models.multi_access:multi_access", NetworkLog, arrange="dtprob.models.multi_access:records"
     ),
 }
 """The models that a CASE can name."""

@@ -166,7 +166,8 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
     paths = None
     if needs_paths and isinstance(data, ChannelData):
         data, paths = reached(case, data, cache, say)
-    columns = data.arrays()
+    arrange = MODELS[case.model.name].arranger() if case.model.name in MODELS else None
+    columns = data.arrays() if arrange is None else _arranged(case, arrange, data)
     arguments = {name: _as_jax(array) for name, array in columns.items() if name in takes}
     if case.data.cluster is not None and case.data.cluster in columns:
         arguments[case.data.cluster] = columns[case.data.cluster]
@@ -181,7 +182,23 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
             raise InputError(f"{case.path.name} [data] phase", expected, case.data.phase, remedy)
     if case.model.name in MODELS:
         arguments |= {name: jnp.asarray(v) for name, v in MODELS[case.model.name].derive(arguments).items()}
-    return arguments | _options(case, takes, arguments)
+    own = [] if arrange is None else list(inspect.signature(arrange).parameters)[1:]
+    return arguments | _options(case, takes, arguments, own)
+
+
+def _arranged(case: Case, arrange: Callable[..., dict[str, Any]], data: Data) -> dict[str, Any]:
+    """The arguments that are made from the data and some of the options."""
+    parameters = list(inspect.signature(arrange).parameters.values())[1:]
+    given = {p.name: _frozen(case.model.options[p.name]) for p in parameters if p.name in case.model.options}
+    missing = [p.name for p in parameters if p.default is p.empty and p.name not in given]
+    if missing:
+        where = f"{case.path.name} [model.options]"
+        raise InputError(where, f"a key '{missing[0]}'", "none", f"Add {missing[0]} = ...")
+    try:
+        return arrange(data, **given)
+    except TypeError as error:
+        where = f"{case.path.name} [model.options]"
+        raise InputError(where, "values of the right type", str(error), "Correct the options") from None
 
 
 def _expected(data: Data, kind: type, file: Path, case: Case) -> Data:
@@ -194,17 +211,21 @@ def _expected(data: Data, kind: type, file: Path, case: Case) -> Data:
     raise InputError(file.name, kind.__name__, got, remedy)
 
 
-def _as_jax(array: np.ndarray) -> Any:
-    return array if array.dtype.kind == "U" else jnp.asarray(array)
+def _as_jax(array: Any) -> Any:
+    is_number = isinstance(array, np.ndarray) and array.dtype.kind != "U"
+    return jnp.asarray(array) if is_number else array
 
 
-def _options(case: Case, takes: Mapping[str, inspect.Parameter], taken: Iterable[str]) -> dict[str, Any]:
-    where = f"{case.path.name} [model.options]"
+def _options(
+    case: Case, takes: Mapping[str, inspect.Parameter], taken: Iterable[str], own: Iterable[str]
+) -> dict[str, Any]:
+    """The model's options; those in ``own`` have been used to arrange the data."""
+    where, own = f"{case.path.name} [model.options]", set(own)
     free = [name for name in takes if name not in set(taken)]
     for name in case.model.options:
-        if name not in free:
-            raise unknown_name(where, name, free, "option")
-    return {name: _frozen(value) for name, value in case.model.options.items()}
+        if name not in free and name not in own:
+            raise unknown_name(where, name, {*free, *own}, "option")
+    return {name: _frozen(value) for name, value in case.model.options.items() if name not in own}
 
 
 def _frozen(value: Any) -> Any:

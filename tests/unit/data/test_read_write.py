@@ -41,9 +41,15 @@ def power_arrays() -> dict[str, np.ndarray]:
 def log_columns() -> dict[str, np.ndarray]:
     rng = np.random.default_rng(5)
     columns = {"episode": np.repeat([0, 1], 5), "slot": np.tile(np.arange(5), 2)}
-    for name in ("buffer", "action", "ack", "arrival"):
-        for device in range(2):
-            columns[f"{name}_{device}"] = rng.integers(0, 2, 10)
+    for device in range(2):
+        action, arrival = rng.integers(0, 2, (2, 10))
+        buffer, ack = np.zeros(10, int), np.zeros(10, int)
+        for row in range(10):
+            if row % 5:
+                buffer[row] = min(buffer[row - 1] + arrival[row - 1] - ack[row - 1], 1)
+            ack[row] = action[row] * buffer[row] * rng.integers(0, 2)
+        values = {"buffer": buffer, "action": action, "ack": ack, "arrival": arrival}
+        columns |= {f"{name}_{device}": value for name, value in values.items()}
     return columns
 
 

@@ -1,0 +1,92 @@
+"""Network logs: what is wrong with a row is said, with the row."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dtprob.data import read
+from dtprob.data.write import file_arrays
+from dtprob.errors import InputError
+from tests.small_network import simulate
+
+
+@pytest.fixture
+def columns():
+    return pd.DataFrame(file_arrays(simulate(12, 3, episodes=2)))
+
+
+def changed(columns, row, **values):
+    columns = columns.copy()
+    for name, value in values.items():
+        columns.loc[row, name] = value
+    return columns
+
+
+def first(columns, **values):
+    """The first row at which columns have given values."""
+    return int(np.flatnonzero(np.all([columns[name] == value for name, value in values.items()], axis=0))[0])
+
+
+def saved(tmp_path, columns):
+    columns.to_csv(tmp_path / "log.csv", index=False)
+    return tmp_path / "log.csv"
+
+
+def test_a_sound_log(tmp_path, columns):
+    log = read(saved(tmp_path, columns))
+    assert log.buffer.shape == (24, 4)
+
+
+def test_a_missing_slot_is_named_and_can_split_the_episode(tmp_path, columns):
+    path = saved(tmp_path, columns.drop(index=5))
+    with pytest.raises(
+        InputError, match=r"slot: expected slot 5 of episode 0, got row 6 \(episode 0, slot 6\)"
+    ):
+        read(path)
+    log = read(path, {"allow_gaps": True})
+    assert np.array_equal(np.unique(log.episode, return_counts=True)[1], [5, 6, 12])
+
+
+def test_an_empty_episode_is_named(tmp_path, columns):
+    columns["episode"] *= 2
+    with pytest.raises(InputError, match=r"episode: expected a slot or more of episode 1, got none"):
+        read(saved(tmp_path, columns))
+    assert len(np.unique(read(saved(tmp_path, columns), {"allow_gaps": True}).episode)) == 2
+
+
+def test_a_delivery_without_sending_is_named(tmp_path, columns):
+    row = first(columns, action_2=0)
+    message = rf"ack_2: expected 0 where the action is 0, got 1 in row {row + 1} \(episode 0, slot {row}\)"
+    with pytest.raises(InputError, match=message):
+        read(saved(tmp_path, changed(columns, row, ack_2=1)))
+
+
+def test_a_delivery_from_an_empty_buffer_is_named(tmp_path, columns):
+    message = r"ack_1: expected 0 where the buffer is 0, got 1 in row 1 "
+    with pytest.raises(InputError, match=message):
+        read(saved(tmp_path, changed(columns, 0, action_1=1, ack_1=1)))
+
+
+def test_a_buffer_that_cannot_follow_is_named(tmp_path, columns):
+    row = first(columns, arrival_3=0, buffer_3=0)
+    message = rf"buffer_3: expected 0 after the slot before, got 1 in row {row + 2} "
+    with pytest.raises(InputError, match=message):
+        read(saved(tmp_path, changed(columns, row + 1, buffer_3=1, ack_3=0)))
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda c: c.assign(buffer_9=0), "buffer_4: expected a column, got nothing"),
+        (lambda c: c.iloc[:0], "expected at least one row, got an empty table"),
+        (lambda c: changed(c, 3, action_0=2), r"action: expected 0 or 1, got 2 in row 4 "),
+    ],
+)
+def test_other_faults(tmp_path, columns, change, message):
+    with pytest.raises(InputError, match=message):
+        read(saved(tmp_path, change(columns)))
+
+
+def test_an_unknown_option_is_named(tmp_path, columns):
+    with pytest.raises(InputError, match="Did you mean 'allow_gaps'"):
+        read(saved(tmp_path, columns), {"alow_gaps": True})

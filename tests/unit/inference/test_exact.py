@@ -1,0 +1,92 @@
+"""The exact engine: counts from the model itself, closed forms, refusals, agreement with NUTS."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from scipy import special
+
+from dtprob.errors import InputError
+from dtprob.inference import NUTS, Point
+from dtprob.inference.exact import DirichletTables, Exact
+from dtprob.models.dirichlet import LogDirichlet
+from dtprob.models.factored import Factor, Logistic, Table, factored
+from dtprob.models.multi_access import multi_access, priors, records, window_counts
+from tests.small_network import CLUSTERS, simulate
+
+KEY = jax.random.key(0)
+
+
+@pytest.fixture(scope="module")
+def arguments():
+    return {**records(simulate(60, 1), clusters=CLUSTERS), "concentration": 1.0}
+
+
+@pytest.fixture(scope="module")
+def posterior(arguments):
+    return Exact(draws=4000)(KEY, multi_access, arguments)
+
+
+def test_counts_are_found_from_the_model(arguments, posterior):
+    for name, counts in window_counts(arguments).items():
+        free = (priors(arguments["clusters"], 1.0)[name] > 0).sum(axis=-1, keepdims=True) > 1
+        np.testing.assert_allclose(posterior.extra[f"counts.{name}"], counts.sum(axis=0) * free, atol=1e-6)
+
+
+def test_draws_have_the_moments_of_the_closed_form(arguments, posterior):
+    counts = {name: value.sum(axis=0) for name, value in window_counts(arguments).items()}
+    law = DirichletTables(priors(arguments["clusters"], 1.0)).updated(counts)
+    for name, a in law.concentration.items():
+        mask = a > 0
+        total = np.broadcast_to(a.sum(axis=-1, keepdims=True), a.shape)
+        draws = posterior.flat(name)
+        mean = np.where(mask, special.digamma(np.where(mask, a, 1)) - special.digamma(total), 0)[mask]
+        sd = np.sqrt(np.maximum(special.polygamma(1, a[mask]) - special.polygamma(1, total[mask]), 0))
+        np.testing.assert_array_less(
+            np.abs(draws[:, mask].mean(axis=0) - mean), 4.5 * sd / np.sqrt(len(draws)) + 1e-9
+        )
+        assert np.all(np.isneginf(draws[:, ~mask]))
+
+
+def test_evidence_is_the_chain_rule_of_predictions():
+    def coin(y=None):
+        table = numpyro.sample("table", LogDirichlet(0.5, np.ones(3, dtype=bool)))
+        with numpyro.plate("toss", 4):
+            numpyro.sample("y", dist.Categorical(logits=table), obs=y)
+
+    y = jnp.array([0, 2, 2, 0])
+    evidence = float(Exact(draws=10)(KEY, coin, {"y": y}).extra["log_evidence"])
+    assert evidence == pytest.approx(np.log((0.5 / 1.5) * (0.5 / 2.5) * (1.5 / 3.5) * (1.5 / 4.5)), rel=1e-6)
+
+
+def test_agrees_with_nuts():
+    rng = np.random.default_rng(0)
+    columns = {"a": rng.integers(0, 2, (1, 40)), "b": rng.integers(0, 3, (1, 40))}
+    model = factored([Factor("b", "b", ("a",), Table("log_b", {"a": 2}, 3, 0.8))])
+    exact = Exact(draws=4000)(KEY, model, columns).flat("log_b")
+    nuts = NUTS(warmup=300, draws=1000, chains=2)(KEY, model, columns).flat("log_b")
+    error = np.sqrt(exact.var(axis=0) / 4000 + nuts.var(axis=0) / 500)
+    np.testing.assert_array_less(np.abs(exact.mean(axis=0) - nuts.mean(axis=0)), 5 * error)
+
+
+def test_mode_is_the_textbooks(arguments):
+    data = {**arguments, "concentration": 1.01}
+    point = Point()(KEY, multi_access, data).flat("log_arrival")[0]
+    counts = window_counts(arguments)["log_arrival"].sum(axis=0) + 0.01
+    np.testing.assert_allclose(np.exp(point), counts / counts.sum(axis=-1, keepdims=True), atol=1e-4)
+
+
+def test_refuses_what_is_not_conjugate():
+    columns = {"a": np.ones((1, 5), int), "b": np.zeros((1, 5), int)}
+    logistic = factored([Factor("b", "b", ("a",), Logistic("w", ("a",), 2))])
+    with pytest.raises(InputError, match=r"expected latent sites that are Dirichlet tables .* got 'w'"):
+        Exact()(KEY, logistic, columns)
+
+    def tempered(y=None):
+        table = numpyro.sample("table", LogDirichlet(1.0, np.ones(2, dtype=bool)))
+        numpyro.sample("y", dist.Categorical(logits=0.5 * table), obs=y)
+
+    with pytest.raises(InputError, match="product of powers of the tables' entries"):
+        Exact()(KEY, tempered, {"y": jnp.array(1)})
