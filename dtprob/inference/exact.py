@@ -98,7 +98,7 @@ class Exact(AbstractEngine):
         found = conjugate(target, inputs, check_key(key))
         law = DirichletTables({n: np.asarray(a) for n, a in found.prior.items()}).updated(found.counts)
         tables = law.sample(key, self.draws)
-        free = {name: LogRatios(found.allowed[name])._inverse(tables[name]) for name in target.coordinates}  # noqa: SLF001
+        free = {name: LogRatios(found.allowed[name]).inv(tables[name]) for name in target.coordinates}
         flat = jnp.concatenate([jnp.reshape(u, (self.draws, -1)) for u in free.values()], axis=-1)
         positions = (flat - inputs.location) / inputs.scale
         evidence = found.constant + sum(

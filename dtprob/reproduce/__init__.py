@@ -7,6 +7,8 @@ from collections.abc import Mapping
 from typing import Final
 
 FIGURES: Final[Mapping[str, str]] = {
+    "fig3": "dtprob.reproduce.fig3",
+    "fig2": "dtprob.reproduce.fig2",
     "fig9": "dtprob.reproduce.fig9",
     "fig10": "dtprob.reproduce.fig10",
     "label_grid": "dtprob.reproduce.label_grid",

@@ -79,9 +79,9 @@ def window_counts(arguments: Mapping[str, Any], *, memory: bool = False) -> dict
     arrivals, previous = (np.asarray(arguments[name])[valid] for name in ("arrivals", "previous"))
     shape = clusters.arrival_allowed(memory=memory).shape
     arrival = np.zeros((len(valid), *shape))
-    for cluster in range(shape[0]):
-        last = previous[:, cluster] if memory else np.zeros(len(previous), int)
-        np.add.at(arrival, (episode, cluster, last, arrivals[:, cluster]), 1.0)
+    last = previous if memory else np.zeros_like(previous)
+    place: Any = (episode[:, None], np.arange(shape[0]), last, arrivals)
+    np.add.at(arrival, place, 1.0)
     senders = np.asarray(arguments["sending"])[valid].sum(axis=-1)
     reception = np.zeros((len(valid), clusters.devices + 1, clusters.devices + 1))
     np.add.at(reception, (episode, senders, np.asarray(arguments["deliveries"])[valid]), 1.0)

@@ -1,0 +1,1 @@
+"""What a posterior is for: watch the physical twin, foresee it, ask what would have been."""

@@ -1,0 +1,100 @@
+"""How likely each window of a log is under each draw of a sampler, factor by factor; all in log space."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpyro import handlers
+from numpyro.infer.util import compute_log_probs
+
+from dtprob.errors import InputError
+from dtprob.models.declaration import Data, Model, declare, split_static
+
+type Likelihoods = dict[str, Float[np.ndarray, "draw window"]]
+
+_BATCH = 16
+
+
+def window_likelihoods(
+    model: Model,
+    data: Data,
+    draws: Mapping[str, Any],
+    *,
+    window: str | None = None,
+    apart: Sequence[str] = (),
+) -> Likelihoods:
+    """Log likelihood of each window under each draw, for each factor (observed site) of any model.
+
+    Args:
+        model: a NumPyro model.
+        data: its arguments by name, the observed ones present.
+        draws: of every latent site, (draw, *event); a point estimate is one draw.
+        window: the axis whose entries are windows; the model's cluster by default.
+        apart: axes whose entries are factors of their own, as "cluster" makes arrivals[0] and arrivals[1].
+
+    Raises:
+        InputError: draws of a latent site are missing, or an observed site has no such window.
+    """
+    declaration = declare(model, data)
+    missing = [name for name in declaration.latent if name not in draws]
+    if missing:
+        remedy = "Sample them from a posterior of this model"
+        raise InputError("draws", f"every latent site of {declaration.name}", f"no {missing[0]!r}", remedy)
+    axis = window or declaration.cluster
+    axes = {name: site.axes for name, site in declaration.observed.items()}
+    for name, own in axes.items():
+        if axis not in own:
+            remedy = "Name the axis of the windows"
+            raise InputError(f"windows of {name!r}", f"one of {', '.join(own)}", repr(axis), remedy)
+    arrays, static = split_static(data)
+
+    @jax.jit
+    def run(values: Mapping[str, Array], arrays: Any) -> dict[str, Array]:
+        def one(value: Mapping[str, Array]) -> dict[str, Array]:
+            fixed = handlers.substitute(handlers.seed(model, jax.random.key(0)), data=dict(value))
+            terms, _ = compute_log_probs(fixed, (), eqx.combine(arrays, static), {}, sum_log_prob=False)
+            return {name: _summed(terms[name], own, str(axis), apart) for name, own in axes.items()}
+
+        return jax.lax.map(one, values, batch_size=_BATCH)
+
+    found = run({name: jnp.asarray(draws[name]) for name in declaration.latent}, arrays)
+    return {label: part for name, value in found.items() for label, part in _parts(name, np.asarray(value))}
+
+
+def _summed(term: Array, axes: tuple[str, ...], window: str, apart: Sequence[str]) -> Array:
+    """Summed over all axes but the window's, which comes first, and those that stay apart."""
+    kept = [i for i, axis in enumerate(axes) if axis in apart and axis != window]
+    moved = jnp.moveaxis(term, [axes.index(window), *kept], range(1 + len(kept)))
+    return jnp.sum(moved, axis=tuple(range(1 + len(kept), moved.ndim)))
+
+
+def _parts(name: str, value: np.ndarray) -> list[tuple[str, np.ndarray]]:
+    if value.ndim == 2:
+        return [(name, value)]
+    return [
+        (f"{name}[{','.join(map(str, index))}]", value[(slice(None), slice(None), *index)])
+        for index in np.ndindex(*value.shape[2:])
+    ]
+
+
+def table_likelihoods(counts: Mapping[str, np.ndarray], draws: Mapping[str, np.ndarray]) -> Likelihoods:
+    """The same from counts alone, where the model is tables of log-probabilities.
+
+    Args:
+        counts: for each table, how often each entry occurred in each window, (window, *table).
+        draws: for each table, (draw, *table).
+    """
+    found: Likelihoods = {}
+    for name, count in counts.items():
+        table = np.asarray(draws[name], float).reshape(len(draws[name]), -1)
+        occurred = count.reshape(len(count), -1).T
+        never = np.isneginf(table)
+        value = np.where(never, 0.0, table) @ occurred
+        found[name] = np.where(never.astype(float) @ (occurred > 0) > 0, -np.inf, value)
+    return found

@@ -1,0 +1,154 @@
+"""Watching a physical twin: has it left what was learned of it, since when, and in which factor."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, final
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dtprob.errors import InputError, unknown_name
+from dtprob.models.declaration import Data, Model
+from dtprob.twin import statistics
+from dtprob.twin.likelihood import Likelihoods, window_likelihoods
+
+type Statistic = Literal["disagreement", "surprise", "evidence"]
+
+STATISTICS: tuple[Statistic, ...] = ("disagreement", "surprise", "evidence")
+
+
+@final
+@dataclass(frozen=True)
+class Watch:
+    """What a monitor says of windows in their order.
+
+    Attributes:
+        statistic: of each window, all factors together.
+        p_value: of each window against the normal ones.
+        alarm: where the statistic exceeds the calibrated threshold.
+        evidence: log e-value for a change of each factor in each window; without draws of what a change may bring none.
+        detector: log of the sequential detector over all factors.
+        run_length: mean windows to a false alarm that the sequential detector is set to.
+    """
+
+    statistic: Float[np.ndarray, " window"]
+    p_value: Float[np.ndarray, " window"]
+    alarm: Bool[np.ndarray, " window"]
+    evidence: Mapping[str, Float[np.ndarray, " window"]]
+    detector: Float[np.ndarray, " window"]
+    run_length: float
+
+    @property
+    def detected(self) -> int | None:
+        """The window in which the sequential detector raises the alarm; None while it does not."""
+        crossed = np.flatnonzero(self.detector >= np.log(self.run_length))
+        return int(crossed[0]) if crossed.size else None
+
+    @property
+    def factors(self) -> dict[str, float]:
+        """Probability of each factor to be the one that changed, up to the alarm or the end."""
+        last = self.detected
+        paths = {
+            name: statistics.detector(e)[-1 if last is None else last] for name, e in self.evidence.items()
+        }
+        top = max(paths.values())
+        weight = {name: float(np.exp(value - top)) for name, value in paths.items()}
+        return {name: value / sum(weight.values()) for name, value in weight.items()}
+
+    @property
+    def changed(self) -> str | None:
+        """The factor that most likely changed; None without an alarm."""
+        return None if self.detected is None else max(self.factors, key=lambda name: self.factors[name])
+
+
+@final
+@dataclass(frozen=True)
+class Monitor:
+    """A model with what was learned of it, watching windows of new data.
+
+    Attributes:
+        model: a NumPyro model whose clusters are the windows.
+        draws: of its latent sites from any sampler, (draw, *event); one draw is the frequentist rival.
+        changed: draws of what a change may bring, as from the prior; needed for evidence and detection.
+        statistic: what single windows are judged by: "disagreement" of the ensemble, "surprise" (minus the log
+            predictive), or "evidence" for a change.
+        apart: axes whose entries are factors of their own, as "cluster".
+        normal: the statistic of held-out normal windows, from `calibrated`.
+        rate: probability of a false alarm per window.
+        run_length: mean windows to a false alarm of the sequential detector.
+
+    Raises:
+        InputError: an unknown statistic, or evidence without `changed`.
+    """
+
+    model: Model
+    draws: Mapping[str, Any]
+    changed: Mapping[str, Any] | None = None
+    statistic: Statistic = "surprise"
+    apart: tuple[str, ...] = ()
+    normal: Float[np.ndarray, " window"] | None = None
+    rate: float = 0.05
+    run_length: float = 1000.0
+
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        if self.statistic not in STATISTICS:
+            raise unknown_name("statistic of a monitor", self.statistic, STATISTICS, "statistic")
+        if self.statistic == "evidence" and self.changed is None:
+            remedy = "Sample the model's prior"
+            raise InputError("monitor by evidence", "draws of what a change may bring", "none", remedy)
+
+    def calibrated(self, data: Data) -> Monitor:
+        """The monitor with its threshold set by normal windows that it has not learned from.
+
+        Args:
+            data: the model's arguments by name.
+
+        Raises:
+            InputError: too few windows for the rate of false alarms.
+        """
+        value, _ = self._judged(data)
+        statistics.threshold(value, self.rate)
+        return replace(self, normal=value)
+
+    def watch(self, data: Data) -> Watch:
+        """Judge windows in their order.
+
+        Args:
+            data: the model's arguments by name.
+
+        Raises:
+            InputError: the monitor is not calibrated.
+        """
+        if self.normal is None:
+            raise InputError(
+                "monitor", "one that is calibrated", "none", "Call calibrated with normal data first"
+            )
+        value, evidence = self._judged(data)
+        path = statistics.detector(statistics.mixed(evidence)) if evidence else np.full(len(value), -np.inf)
+        return Watch(
+            statistic=value,
+            p_value=statistics.p_value(value, self.normal),
+            alarm=value > statistics.threshold(self.normal, self.rate),
+            evidence=evidence,
+            detector=path,
+            run_length=self.run_length,
+        )
+
+    def _judged(self, data: Data) -> tuple[Float[np.ndarray, " window"], dict[str, np.ndarray]]:
+        """The statistic over all factors, and each factor's evidence."""
+        normal = window_likelihoods(self.model, data, self.draws, apart=self.apart)
+        evidence: dict[str, np.ndarray] = {}
+        if self.changed is not None:
+            other = window_likelihoods(self.model, data, self.changed, apart=self.apart)
+            evidence = {name: statistics.log_evidence(other[name], normal[name]) for name in normal}
+        if self.statistic == "evidence":
+            return statistics.mixed(evidence), evidence
+        judge = statistics.disagreement if self.statistic == "disagreement" else statistics.surprise
+        return judge(_total(normal)), evidence
+
+
+def _total(likelihoods: Likelihoods) -> Float[np.ndarray, "draw window"]:
+    return np.sum(list(likelihoods.values()), axis=0)
