@@ -6,6 +6,7 @@ whose draws are laid out (chain, draw, *event). `fit` takes the engine's name in
 
 from dtprob.inference.blackjax_nuts import BlackJAXNUTS
 from dtprob.inference.engine import AbstractEngine, RunOptions
+from dtprob.inference.ensemble import Ensemble
 from dtprob.inference.fit import ENGINES, fit, resolve
 from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
@@ -23,6 +24,7 @@ __all__ = [
     "SVI",
     "AbstractEngine",
     "BlackJAXNUTS",
+    "Ensemble",
     "Laplace",
     "Point",
     "PointMass",

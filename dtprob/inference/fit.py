@@ -11,6 +11,7 @@ import jax
 from dtprob.errors import InputError, unknown_name
 from dtprob.inference.blackjax_nuts import BlackJAXNUTS
 from dtprob.inference.engine import DEFAULT, AbstractEngine, RunOptions
+from dtprob.inference.ensemble import Ensemble
 from dtprob.inference.exact import Exact
 from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
@@ -22,7 +23,8 @@ from dtprob.inference.von_mises_em import VonMisesEM
 from dtprob.models.declaration import Model
 
 ENGINES: Mapping[str, type[AbstractEngine]] = {
-    engine.name: engine for engine in (NUTS, BlackJAXNUTS, SMC, SVI, VonMisesEM, Laplace, Exact, Point)
+    engine.name: engine
+    for engine in (NUTS, BlackJAXNUTS, SMC, SVI, VonMisesEM, Laplace, Exact, Ensemble, Point)
 }
 
 

@@ -15,6 +15,7 @@ import numpyro.distributions as dist
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 
 from dtprob.inference import von_mises
+from dtprob.inference.circular import wrap
 from dtprob.inference.optimise import DENSE_LIMIT, curvature, gradient_and_hessian
 from dtprob.inference.target import Inputs, Target
 
@@ -80,7 +81,7 @@ def draw(
 ) -> Float[Array, " dimension"]:
     """One draw, angles unwrapped; differentiable in the guide."""
     linear_key, angle_key = jax.random.split(key)
-    v = _normal(family, guide).sample(linear_key)
+    v = jnp.asarray(_normal(family, guide).sample(linear_key))
     linear = target.linear
     z = von_mises.sample(angle_key, *_angles(target, guide, anchor), 1)[0]
     u = anchor.point.at[linear].add(_scaled(anchor, v))
@@ -97,8 +98,8 @@ def log_density(
         v, volume = offset / anchor.root, jnp.sum(jnp.log(anchor.root))
     else:
         v, volume = jnp.linalg.solve(anchor.root, offset), jnp.linalg.slogdet(anchor.root)[1]
-    angles = dist.VonMises(*_angles(target, guide, anchor)).log_prob(u[target.angles])
-    return _normal(family, guide).log_prob(v) - volume + jnp.sum(angles)
+    angles = dist.VonMises(*_angles(target, guide, anchor)).log_prob(wrap(u[target.angles]))
+    return jnp.asarray(_normal(family, guide).log_prob(v)) - volume + jnp.sum(angles)
 
 
 def _scaled(anchor: Anchor, v: Array) -> Array:

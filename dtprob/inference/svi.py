@@ -210,7 +210,9 @@ def weight_facts(log_weight: Float[np.ndarray, " draw"]) -> dict[str, Any]:
         return {"pareto_k": -np.inf, "log_evidence": evidence}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # of too few draws for a tail: the index is infinite then
-        _, index = array_stats.psislw(log_weight.copy())
+        _, index = array_stats.psislw(
+            -log_weight
+        )  # which takes minus the log weights, as of a likelihood left out
     return {"pareto_k": float(index), "log_evidence": evidence}
 
 
@@ -259,7 +261,7 @@ def _window(  # noqa: PLR0917
         guide, state, total = carry
         value, slope = jax.value_and_grad(loss)(guide, number)
         change, state = optimiser.update(slope, state, guide)
-        guide = optax.apply_updates(guide, change)
+        guide: Guide = jax.tree.map(jnp.add, guide, change)
         return (guide, state, jax.tree.map(jnp.add, total, guide)), -value
 
     nothing = jax.tree.map(jnp.zeros_like, ascent.guide)

@@ -1,0 +1,248 @@
+"""Ensembles: one estimate for each of many data sets like the one observed.
+
+With point estimates this is randomised maximum a posteriori. A member maximises the posterior density of data
+with noise added anew (or re-weighted), tilted by the prior's score at a draw from the prior. For a Gaussian
+prior the tilt moves the prior's mean to that draw; so with a linear model and Gaussian noise each member is
+an independent, exact draw from the posterior (Bardsley, Solonen, Haario and Laine, Randomize-then-optimize,
+2014; Oliver, He and Reynolds, Conditioning permeability fields to pressure data, 1996). Elsewhere it is an
+approximation. With an engine that draws, it is the bagged posterior (Huggins and Miller, Robust and
+reproducible model selection using bagged posteriors, 2019).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from dtprob.errors import InputError
+from dtprob.inference.assemble import assemble
+from dtprob.inference.build import build_target
+from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
+from dtprob.inference.iterate import Job, Steps, iterate
+from dtprob.inference.modes import find_mode
+from dtprob.inference.optimise import minimise
+from dtprob.inference.posterior import Posterior
+from dtprob.inference.progress import Progress
+from dtprob.inference.resample import (
+    WEIGHTS,
+    Scheme,
+    Weighted,
+    chosen_scheme,
+    cluster_axis,
+    cluster_weights,
+    with_noise,
+)
+from dtprob.inference.target import Inputs, Target
+from dtprob.models.declaration import Data, Model
+
+_BLOCK = 32  # members optimised side by side
+
+
+class Members(NamedTuple):
+    """The state of a run: the point estimates so far.
+
+    Attributes:
+        fitted: the estimate on the data themselves, from which each member starts.
+        positions: of each member.
+        converged: whether its search arrived.
+        done: how many there are.
+    """
+
+    fitted: Float[Array, " dimension"]
+    positions: Float[Array, "member dimension"]
+    converged: Bool[Array, " member"]
+    done: Array
+
+
+@dataclass(frozen=True)
+class Ensemble(AbstractEngine):
+    """One estimate for each of many data sets resampled from the one observed: randomised MAP, or bagging.
+
+    With the base engine "point" a member is the mode of the density over the unconstrained coordinates, and
+    a draw of the posterior; the statistic `diverging` marks those whose search did not arrive. With another
+    base engine all draws of all members are the posterior's, one member after the other in a single chain.
+
+    Attributes:
+        members: how many data sets.
+        base: name of the engine that each is given to.
+        settings: that engine's settings, where it is not "point".
+        resample: "noise" adds noise drawn from the fitted model to normal data; "weights" gives each of the
+            model's clusters a random weight, "clusters" draws them with replacement; "none" leaves data
+            alone; "auto" is noise for points from normal data, else weights.
+        perturb_prior: tilt the prior at random too (points only); without it the prior is not spread out.
+        starts: from how many points the mode on the data themselves is sought.
+        initial: constrained values to start from; sites without one start from the prior.
+        max_steps: bound on the steps of each search.
+    """
+
+    name: ClassVar[str] = "ensemble"
+    answer: ClassVar[Answer] = "approximation"
+
+    members: int = 200
+    base: str = "point"
+    settings: Mapping[str, Any] | None = None
+    resample: Literal["auto", "noise", "weights", "clusters", "none"] = "auto"
+    perturb_prior: bool = True
+    starts: int = 4
+    initial: Mapping[str, Any] | None = None
+    max_steps: int = 200
+
+    def __call__(
+        self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
+    ) -> Posterior:
+        """Infer; see `AbstractEngine`."""
+        check_counts(self, {"members": 1, "starts": 1, "max_steps": 1})
+        check_key(key)
+        target, inputs = build_target(model, data)
+        is_point = self.base == "point"
+        scheme = chosen_scheme(target, self.resample, point=is_point)
+        weighted, arrays = target, inputs
+        if scheme in ("weights", "clusters"):
+            cluster, count = cluster_axis(target.declaration)
+            given = {**data, WEIGHTS: jnp.ones(count)}
+            weighted, arrays = build_target(Weighted(model, cluster), given)
+            arrays = arrays._replace(location=inputs.location, scale=inputs.scale)
+        if is_point:
+            job = Job(self, target, inputs, key, options)
+            found, _ = iterate(job, self._steps(weighted, arrays, scheme, key))
+            positions, failed = np.asarray(found.positions), ~np.asarray(found.converged)
+        else:
+            positions, failed = self._bagged(weighted, arrays, scheme, key, options)
+        return assemble(
+            target,
+            inputs,
+            positions[None],
+            engine=self,
+            key=key,
+            options=options,
+            stats={"diverging": failed[None]},
+            extra={"converged": not failed.any(), "resampled_by": np.asarray(scheme)},
+        )
+
+    def _mode(self, target: Target, inputs: Inputs, key: PRNGKeyArray) -> Float[Array, " dimension"]:
+        mode = find_mode(
+            target,
+            inputs,
+            key,
+            objective="density",
+            initial=self.initial,
+            starts=self.starts,
+            max_steps=self.max_steps,
+        )
+        return mode.optimum.position
+
+    def _steps(self, target: Target, inputs: Inputs, scheme: Scheme, key: PRNGKeyArray) -> Steps[Members]:
+        search_key, member_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
+        solve = target.compiled(_block, scheme, self.perturb_prior, self.max_steps)
+
+        def begin() -> Members:
+            fitted = self._mode(target, inputs, search_key)
+            positions = jnp.zeros((self.members, target.dimension), fitted.dtype)
+            return Members(fitted, positions, jnp.zeros(self.members, bool), jnp.zeros((), int))
+
+        def step(_: int, before: Members) -> tuple[Members, dict[str, Any]]:
+            first = int(before.done)
+            last = min(first + _BLOCK, self.members)
+            found, arrived = solve(before.fitted, first, member_key, inputs)
+            positions = before.positions.at[first:last].set(found[: last - first])
+            converged = before.converged.at[first:last].set(arrived[: last - first])
+            return Members(before.fitted, positions, converged, jnp.asarray(last)), {}
+
+        return Steps(
+            begin,
+            step,
+            finished=lambda members: int(members.done) >= self.members,
+            most=-(-self.members // _BLOCK),
+            phase=f"x {_BLOCK} members",
+            note=lambda members: f"{int(jnp.sum(members.converged))} arrived",
+        )
+
+    def _bagged(
+        self, target: Target, inputs: Inputs, scheme: Scheme, key: PRNGKeyArray, options: RunOptions
+    ) -> tuple[Float[np.ndarray, "draw dimension"], Bool[np.ndarray, " draw"]]:
+        """All draws of all members, as positions, and whether they diverged."""
+        from dtprob.inference.fit import resolve  # noqa: PLC0415  (which knows this engine)
+
+        if self.base == self.name:
+            raise InputError("base of engine ensemble", "another engine", self.base, 'Give "point" or "nuts"')
+        engine = resolve(self.base, **(self.settings or {}))
+        quiet = replace(
+            options, progress=False, status_file=None, checkpoint=None, resume=False, pointwise=False
+        )
+        is_noise = scheme == "noise"
+        fitted = self._mode(target, inputs, jax.random.fold_in(key, 0)) if is_noise else jnp.zeros(0)
+        places = target.compiled(_places)
+        positions: list[np.ndarray] = []
+        diverging: list[np.ndarray] = []
+        with Progress(self.name, self.members, options.progress, options.status_file) as progress:
+            for number in range(self.members):
+                own = jax.random.fold_in(jax.random.fold_in(key, 1), number)
+                arrays = target.compiled(_resampled, scheme)(fitted, own, inputs)
+                given: Data = target.data(arrays)
+                found = engine(jax.random.fold_in(own, 1), target.model, given, options=quiet)
+                positions.append(np.asarray(places({n: found.flat(n) for n in found.latent}, inputs)))
+                diverging.append(np.ravel(found.sample_stats["diverging"]))
+                progress.report(number + 1, "members")
+        return np.concatenate(positions), np.concatenate(diverging)
+
+
+def _places(target: Target, values: Mapping[str, Array], inputs: Inputs) -> Float[Array, "draw dimension"]:
+    """The coordinates of draws of all latent sites."""
+    return jax.lax.map(lambda value: target.prior_median(inputs, value), dict(values))
+
+
+def _resampled(target: Target, scheme: Scheme, fitted: Array, key: PRNGKeyArray, inputs: Inputs) -> Inputs:
+    """The arrays of one member."""
+    arrays = dict(inputs.arrays)
+    if scheme == "noise":
+        arrays |= with_noise(target, inputs, fitted, key)
+    elif scheme != "none":
+        arrays[WEIGHTS] = cluster_weights(scheme, key, arrays[WEIGHTS].shape[0])
+    return inputs._replace(arrays=arrays)
+
+
+def _block(  # noqa: PLR0917
+    target: Target,
+    scheme: Scheme,
+    tilts: bool,
+    max_steps: int,
+    fitted: Array,
+    first: Array,
+    key: PRNGKeyArray,
+    inputs: Inputs,
+) -> tuple[Float[Array, "member dimension"], Bool[Array, " member"]]:
+    """A block of members, side by side."""
+
+    def one(number: Array) -> tuple[Array, Array]:
+        data_key, prior_key = jax.random.split(jax.random.fold_in(key, number))
+        arrays = _resampled(target, scheme, fitted, data_key, inputs)
+        slope = _prior_score(target, prior_key, inputs) if tilts else jnp.zeros_like(fitted)
+
+        def objective(u: Array) -> Array:
+            return slope @ _linear(target, u) - target.log_density(u, arrays)
+
+        optimum = minimise(objective, fitted, max_steps)
+        return optimum.position, optimum.converged
+
+    return jax.vmap(one)(first + jnp.arange(_BLOCK))
+
+
+def _linear(target: Target, u: Array) -> Array:
+    """What the tilt is linear in: the coordinates, of angles the sine, which is periodic."""
+    return jnp.where(target.circular, jnp.sin(u), u)
+
+
+def _prior_score(target: Target, key: PRNGKeyArray, inputs: Inputs) -> Float[Array, " dimension"]:
+    """The slope of the log prior density at a draw from it: its mean is zero, its covariance Fisher's."""
+
+    def log_prior(u: Array) -> Array:
+        terms = target.log_terms(u, inputs)
+        return terms.prior + terms.jacobian
+
+    return jax.grad(log_prior)(target.prior_draw(key, inputs))

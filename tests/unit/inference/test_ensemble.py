@@ -1,0 +1,108 @@
+"""Ensembles: exact for linear Gaussian models, by every scheme what its definition says, of any base engine."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from scipy import stats
+
+from dtprob.errors import InputError
+from dtprob.inference import Ensemble
+from tests.unit.inference.examples import (
+    at_the_cut,
+    at_the_cut_data,
+    logistic,
+    logistic_data,
+    normal,
+    normal_data,
+)
+
+KEY = jax.random.key(8)
+X = np.random.default_rng(0).normal(size=(9, 2))
+
+
+def linear(x, y=None):
+    with numpyro.plate("column", 2):
+        weight = numpyro.sample("weight", dist.Normal(jnp.asarray([0.5, -1.0]), jnp.asarray([1.0, 2.0])))
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(x @ weight, 0.8), obs=y)
+
+
+def linear_data():
+    return {"x": X, "y": X @ [1.0, 0.5] + np.random.default_rng(1).normal(0, 0.8, 9)}
+
+
+def linear_posterior(data, x=X):
+    precision = np.diag([1.0, 0.25]) + x.T @ x / 0.64
+    covariance = np.linalg.inv(precision)
+    return covariance @ (np.asarray([0.5, -0.25]) + x.T @ data["y"] / 0.64), covariance
+
+
+def test_randomised_map_of_a_linear_gaussian_model_is_the_posterior():
+    """Whitened by the closed form, members are independent standard normals: chi-square and Kolmogorov-Smirnov."""
+    data, members = linear_data(), 600
+    posterior = Ensemble(members=members)(KEY, linear, data)
+    assert str(posterior.extra["resampled_by"]) == "noise"
+    mean, covariance = linear_posterior(data)
+    white = np.linalg.solve(np.linalg.cholesky(covariance), (posterior.flat("weight") - mean).T).ravel()
+    assert stats.kstest(white, "norm").pvalue > 1e-3
+    low, high = stats.chi2.interval(1 - 1e-3, white.size)
+    assert low < np.sum(white**2) < high
+    assert abs(np.corrcoef(white.reshape(2, -1))[0, 1]) < 4 / members**0.5
+    assert not posterior.sample_stats["diverging"].any()
+    few = Ensemble(members=40)(KEY, linear, data)
+    np.testing.assert_array_equal(few.draws["weight"], posterior.draws["weight"][:, :40])
+
+
+def test_without_any_perturbation_all_members_are_the_mode():
+    data = linear_data()
+    posterior = Ensemble(members=3, resample="none", perturb_prior=False)(KEY, linear, data)
+    np.testing.assert_allclose(
+        posterior.flat("weight"), np.tile(linear_posterior(data)[0], (3, 1)), atol=1e-6
+    )
+
+
+def test_a_bootstrap_member_is_the_mode_of_its_weighted_data():
+    """Resampled clusters: every member solves the normal equations of some integer weights that sum to the rows."""
+    data = {"noise": 1.5, "y": np.asarray([0.0] * 11 + [12.0])}
+    posterior = Ensemble(members=300, resample="clusters", perturb_prior=False)(KEY, normal, data)
+    precision = 1 / 9 + 12 / 1.5**2
+    count = (posterior.flat("level") * precision - 1 / 9) * 1.5**2 / 12.0  # times the last row is drawn
+    np.testing.assert_allclose(count, np.round(count), atol=1e-6)
+    observed = np.bincount(np.round(count).astype(int), minlength=4)[:4]
+    expected = 300 * stats.binom.pmf(np.arange(4), 12, 1 / 12)
+    assert np.all(np.abs(observed - expected) < 4 * np.sqrt(expected))
+
+
+def test_weights_leave_the_reported_likelihood_alone():
+    data = normal_data()
+    posterior = Ensemble(members=5, resample="weights")(KEY, normal, data)
+    expected = stats.norm.logpdf(data["y"], posterior.draws["level"][..., None], data["noise"])
+    np.testing.assert_allclose(posterior.log_likelihood["y"], expected)
+
+
+def test_angles_and_discrete_data():
+    posterior = Ensemble(members=64)(KEY, at_the_cut, at_the_cut_data())
+    eta = 3.0 * np.exp(1j * at_the_cut_data()["y"]).sum() + 0.05
+    error = np.angle(np.exp(1j * (posterior.draws["angle"] - np.angle(eta)))).mean()
+    assert abs(error) < 0.1
+    with pytest.raises(InputError, match=r"observed sites that are normal.*'y' \(Bernoulli"):
+        Ensemble(resample="noise")(KEY, logistic, logistic_data())
+
+
+def test_any_engine_can_be_the_base():
+    """Bagging: the members' mean spreads by about as much as the data tell, on top of each one's own spread."""
+    data = linear_data()
+    settings = {"draws": 50}
+    posterior = Ensemble(members=40, base="laplace", settings=settings)(KEY, linear, data)
+    assert posterior.draws["weight"].shape == (1, 2000, 2)
+    mean, covariance = linear_posterior(data)
+    draws = posterior.flat("weight")
+    within = np.mean([np.cov(block.T) for block in draws.reshape(40, 50, 2)], axis=0)
+    assert np.all(np.diag(within) > 0.6 * np.diag(covariance))
+    assert np.all(np.diag(np.cov(draws.T)) > np.diag(within))
+    assert np.all(np.abs(draws.mean(0) - mean) < 4 * np.sqrt(2 * np.diag(covariance) / 40))
+    with pytest.raises(InputError, match="base of engine ensemble"):
+        Ensemble(base="ensemble")(KEY, linear, data)
