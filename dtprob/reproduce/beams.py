@@ -27,7 +27,7 @@ class Site(NamedTuple):
     Attributes:
         scene: name of a scene that sionna-rt ships, or a Mitsuba XML file.
         frequency: carrier, Hz.
-        position: of the array, m; it lies in the plane x = 0 and looks along x.
+        position: of the array, m; its rows lie along y, its columns along z. Users' antennas lie along x.
         spacing: of the grid of positions, m.
         max_depth: most reflections on a path.
         samples: rays shot.
@@ -49,12 +49,14 @@ class BeamPaths(NamedTuple):
         gain: passband gain with the phase of the delay, 1.
         horizontal: direction cosine of departure along the rows of the array, sin(theta) sin(phi).
         vertical: along its columns, cos(theta).
+        arrival: of arrival, along the user's line of antennas.
     """
 
     position: Float[np.ndarray, "position 2"]
     gain: Complex[np.ndarray, "position path"]
     horizontal: Float[np.ndarray, "position path"]
     vertical: Float[np.ndarray, "position path"]
+    arrival: Float[np.ndarray, "position path"]
 
 
 def trace_positions(site: Site, count: int) -> BeamPaths:
@@ -106,7 +108,10 @@ def _trace(scene: Any, site: Site, grid: Float[np.ndarray, "position 2"]) -> Bea
 
 def _strongest(paths: PathSet) -> BeamPaths:
     gain = np.asarray(path_gain(paths, paths.permittivity, paths.conductivity) * paths.carrier_phasor)
-    departure = np.asarray(jnp.where(paths.mask[..., None], paths.departure, 0.0))
+    departure, arrival = (
+        np.asarray(jnp.where(paths.mask[..., None], direction, 0.0))
+        for direction in (paths.departure, -paths.arrival)
+    )
     order = np.argsort(-np.abs(gain), axis=1, kind="stable")[:, :PATHS]
     short = ((0, 0), (0, PATHS - order.shape[1]))
 
@@ -114,4 +119,5 @@ def _strongest(paths: PathSet) -> BeamPaths:
         return np.pad(np.take_along_axis(values, order, axis=1), short)
 
     position = np.asarray(paths.rx_position)[:, :2]
-    return BeamPaths(position, taken(gain), taken(departure[..., 1]), taken(departure[..., 2]))
+    cosines = taken(departure[..., 1]), taken(departure[..., 2]), taken(arrival[..., 0])
+    return BeamPaths(position, taken(gain), *cosines)

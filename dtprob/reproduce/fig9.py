@@ -8,7 +8,9 @@ from jaxtyping import PRNGKeyArray
 
 from dtprob.models.prediction_powered.schemes import SCHEMES
 from dtprob.reproduce import beam_alignment
-from dtprob.reproduce.beams_codebook import VERTICAL
+from dtprob.reproduce.beam_alignment import RATE, Campaign, Case
+from dtprob.reproduce.beams_codebook import Arrays
+from dtprob.reproduce.beams_file import read_paths
 from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
 from dtprob.reproduce.progress import Progress
 
@@ -19,20 +21,17 @@ LABELLED: Final = (300, 3000)
 
 def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
     """The figure; see the module."""
-    paths = beam_alignment.positions(progress)
-    return figure(beam_alignment.Campaign(key, runs, progress, paths), ROWS, LABELLED)
+    return figure(Campaign(key, runs, progress, read_paths()), ROWS, LABELLED)
 
 
-def figure(campaign: beam_alignment.Campaign, rows: Sequence[int], labelled: Sequence[int]) -> Figure:
+def figure(campaign: Campaign, rows: Sequence[int], labelled: Sequence[int]) -> Figure:
     """The figure for given widths of the array and numbers of labels."""
     panels: list[Panel] = []
     for n in labelled:
-        rate = np.stack([campaign.cell(width, n) for width in rows], axis=-1)[:, :, 0]
-        series = [
-            Series.of_runs(name, [VERTICAL * width for width in rows], rate[:, index])
-            for index, name in enumerate(SCHEMES)
-        ]
+        rate = np.stack([campaign.cell(Case(Arrays(width), n)) for width in rows], axis=-1)[:, :, 0]
+        antennas = [Arrays(width).antennas for width in rows]
+        series = [Series.of_runs(name, antennas, rate[:, index]) for index, name in enumerate(SCHEMES)]
         title = f"{n} labelled positions"
-        panels.append(Panel(title, Quantity("antennas", is_log=True), beam_alignment.RATE, tuple(series)))
+        panels.append(Panel(title, Quantity("antennas", is_log=True), RATE, tuple(series)))
     title = "beam alignment with synthetic labels"
     return Figure("fig9", title, tuple(panels), campaign.runs, campaign.notes)
