@@ -4,9 +4,11 @@ Every engine is called the same way, `engine(key, model, data, options=...)`, an
 whose draws are laid out (chain, draw, *event). `fit` takes the engine's name instead.
 """
 
+from dtprob.inference.auto import Auto, choose
 from dtprob.inference.blackjax_nuts import BlackJAXNUTS
 from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.ensemble import Ensemble
+from dtprob.inference.exact import Exact
 from dtprob.inference.fit import ENGINES, fit, resolve
 from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
@@ -23,8 +25,10 @@ __all__ = [
     "SMC",
     "SVI",
     "AbstractEngine",
+    "Auto",
     "BlackJAXNUTS",
     "Ensemble",
+    "Exact",
     "Laplace",
     "Point",
     "PointMass",
@@ -32,6 +36,7 @@ __all__ = [
     "RunOptions",
     "Sampler",
     "VonMisesEM",
+    "choose",
     "fit",
     "resolve",
     "summary",

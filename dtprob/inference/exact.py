@@ -1,4 +1,4 @@
-"""The exact posterior where tables of probabilities meet counts: Dirichlet priors, categorical data.
+"""The exact posterior where tables of probabilities meet counts, or where the posterior is normal.
 
 Which counts a log amounts to is found from the model itself. The log likelihood of tables with counts n is
 sum n_ij log p_ij; its gradient where one outcome of a row has all the probability is the counts of the others. Whether
@@ -31,6 +31,8 @@ from dtprob.inference.engine import (
     check_counts,
     check_key,
 )
+from dtprob.inference.gaussian import gaussian_posterior
+from dtprob.inference.laplace import gaussian_facts
 from dtprob.inference.posterior import Posterior, Values
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model, trace_model
@@ -75,9 +77,10 @@ class DirichletTables:
 
 @dataclass(frozen=True)
 class Exact(AbstractEngine):
-    """Independent draws from the posterior of a model whose unknowns are Dirichlet tables under counts.
+    """Independent draws from a posterior in closed form: Dirichlet tables under counts, or a normal posterior.
 
-    The posterior's `extra` has `log_evidence` and, for each table, `counts.<site>`.
+    The posterior's `extra` has `log_evidence` and, for each table, `counts.<site>`, or of a normal posterior
+    `precision` and `mode` (over the coordinates) and `mode.<site>`. Any other model is refused with a reason.
 
     Attributes:
         draws: how many draws.
@@ -94,8 +97,21 @@ class Exact(AbstractEngine):
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
         check_counts(self, {"draws": 1})
+        check_key(key)
         target, inputs = build_target(model, data)
-        found = conjugate(target, inputs, check_key(key))
+        if not has_tables(target):
+            normal = gaussian_posterior(target, inputs, key)
+            noise = jax.random.normal(key, (self.draws, target.dimension))
+            return assemble(
+                target,
+                inputs,
+                (normal.mode + noise @ normal.factor.T)[None],
+                engine=self,
+                key=key,
+                options=options,
+                extra=gaussian_facts(target, inputs, normal),
+            )
+        found = conjugate(target, inputs, key)
         law = DirichletTables({n: np.asarray(a) for n, a in found.prior.items()}).updated(found.counts)
         tables = law.sample(key, self.draws)
         free = {name: LogRatios(found.allowed[name]).inv(tables[name]) for name in target.coordinates}
@@ -115,6 +131,11 @@ class Exact(AbstractEngine):
             options=options,
             extra={"log_evidence": evidence, **counted},
         )
+
+
+def has_tables(target: Target) -> bool:
+    """Whether some latent site is a Dirichlet table in log space."""
+    return any(site.distribution == "LogDirichlet" for site in target.declaration.latent.values())
 
 
 class Conjugate(NamedTuple):

@@ -9,6 +9,7 @@ from typing import Any, cast
 import jax
 
 from dtprob.errors import InputError, unknown_name
+from dtprob.inference.auto import Auto
 from dtprob.inference.blackjax_nuts import BlackJAXNUTS
 from dtprob.inference.engine import DEFAULT, AbstractEngine, RunOptions
 from dtprob.inference.ensemble import Ensemble
@@ -24,7 +25,18 @@ from dtprob.models.declaration import Model
 
 ENGINES: Mapping[str, type[AbstractEngine]] = {
     engine.name: engine
-    for engine in (NUTS, BlackJAXNUTS, SMC, SVI, VonMisesEM, Laplace, Exact, Ensemble, Point)
+    for engine in (
+        Auto,
+        NUTS,
+        BlackJAXNUTS,
+        SMC,
+        SVI,
+        VonMisesEM,
+        Laplace,
+        Exact,
+        Ensemble,
+        Point,
+    )
 }
 
 

@@ -24,7 +24,8 @@ from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model
 
-_LARGEST = 3000
+LARGEST = 3000
+"""Coordinates that a dense precision is kept for."""
 
 
 class Gaussian(NamedTuple):
@@ -78,9 +79,9 @@ class Laplace(AbstractEngine):
         check_counts(self, {"draws": 1, "starts": 1, "max_steps": 1})
         search_key, draw_key = jax.random.split(check_key(key))
         target, inputs = build_target(model, data)
-        if target.dimension > _LARGEST:
+        if target.dimension > LARGEST:
             remedy = "Use another engine, such as nuts, or point"
-            raise InputError("laplace", f"at most {_LARGEST} coordinates", str(target.dimension), remedy)
+            raise InputError("laplace", f"at most {LARGEST} coordinates", str(target.dimension), remedy)
         mode = find_mode(
             target,
             inputs,
@@ -90,7 +91,7 @@ class Laplace(AbstractEngine):
             starts=self.starts,
             max_steps=self.max_steps,
         )
-        gaussian: Gaussian = target.compiled(_approximate)(mode.optimum.position, inputs)
+        gaussian: Gaussian = target.compiled(approximate)(mode.optimum.position, inputs)
         noise = jax.random.normal(draw_key, (self.draws, target.dimension))
         positions = gaussian.mode + noise @ gaussian.factor.T
         return assemble(
@@ -113,7 +114,15 @@ def gaussian_facts(target: Target, inputs: Inputs, gaussian: Gaussian) -> dict[s
     return {name: np.asarray(value) for name, value in (facts | modes).items()}
 
 
-def _approximate(target: Target, mode: Float[Array, " dimension"], inputs: Inputs) -> Gaussian:
+def approximate(target: Target, mode: Float[Array, " dimension"], inputs: Inputs) -> Gaussian:
+    """The Gaussian with the density's height and curvature at a mode.
+
+    Args:
+        target: the target.
+        mode: its coordinates.
+        inputs: the target's arrays.
+    """
+
     def function(u: Array) -> Array:
         return objective_value(target, "density", u, inputs)
 
