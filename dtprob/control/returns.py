@@ -1,0 +1,53 @@
+"""What actions were worth: returns that mix lengths, and COMA's counterfactual advantage."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+
+def lambda_returns(
+    reward: Float[Array, " slot"],
+    value: Float[Array, " slot"],
+    ends: Bool[Array, " slot"],
+    discount: float,
+    mix: float,
+) -> Float[Array, " slot"]:
+    """TD(lambda) returns, G_t = r_t + discount ((1 - mix) v_{t+1} + mix G_{t+1}).
+
+    Where an episode was cut, and at the last slot, what follows is not known: G_t = v_t there, which only
+    serves the slots before it.
+
+    Args:
+        reward: of each slot.
+        value: v_t, of the state and action of each slot, or of the state.
+        ends: whether the episode was cut after the slot.
+        discount: of the next slot.
+        mix: lambda.
+    """
+    ends = ends.at[-1].set(True)
+
+    def one(
+        after: tuple[Array, Array], slot: tuple[Array, Array, Array]
+    ) -> tuple[tuple[Array, Array], Array]:
+        reward, value, ends = slot
+        following = (1 - mix) * after[0] + mix * after[1]
+        now = jnp.where(ends, value, reward + discount * following)
+        return (value, now), now
+
+    start = (value[-1], value[-1])
+    return jax.lax.scan(one, start, (reward, value, ends), reverse=True)[1]
+
+
+def counterfactual_advantage(
+    value: Float[Array, "*batch choice"], logit: Float[Array, "*batch"], action: Int[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    """How much better a device's action was than what its policy does on average, others' actions kept.
+
+    Args:
+        value: of silence and of sending, given the others' actions.
+        logit: the policy's log-odds of sending.
+        action: that was taken.
+    """
+    chance = jax.nn.sigmoid(logit)
+    average = (1 - chance) * value[..., 0] + chance * value[..., 1]
+    return jnp.where(action > 0, value[..., 1], value[..., 0]) - average

@@ -1,0 +1,128 @@
+"""Playing a policy in an environment: trajectories, and long-run averages on arrivals common to all."""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from dtprob.control.environment import Environment, Observation
+from dtprob.control.policy import Memory, Policy, act
+
+
+class Trajectory(NamedTuple):
+    """Consecutive slots of several environments; each leaf (slot, environment, ...).
+
+    Attributes:
+        observation: before the slot.
+        start: whether an episode begins with the slot.
+        action: what the devices wanted.
+        logit: log-odds of sending that the policy gave.
+        reward: of the slot.
+        truncated: whether the episode was cut after the slot.
+        slot: the kernel's account.
+    """
+
+    observation: Observation
+    start: Bool[Array, "slot environment"]
+    action: Int[Array, "slot environment device"]
+    logit: Float[Array, "slot environment device"]
+    reward: Float[Array, "slot environment"]
+    truncated: Bool[Array, "slot environment"]
+    slot: Any
+
+
+class Play(NamedTuple):
+    """Where several environments and a policy's memories stand; leaves (environment, ...)."""
+
+    state: Any
+    observation: Observation
+    memory: Memory
+    start: Bool[Array, " environment"]
+
+
+def begin(key: PRNGKeyArray, environment: Environment, policy: Policy, count: int) -> Play:
+    """Start episodes in `count` environments."""
+    keys = jax.random.split(key, count)
+    state, observation = jax.vmap(environment.reset)(keys)
+    memory = policy.initial()
+    start = jnp.ones(count, bool)
+    return Play(state, observation, jnp.broadcast_to(memory, (count, *memory.shape)), start)
+
+
+def play(
+    key: PRNGKeyArray, environment: Environment, policy: Policy, now: Play, slots: int
+) -> tuple[Play, Trajectory]:
+    """Go on for some slots.
+
+    Args:
+        key: typed JAX key.
+        environment: the network.
+        policy: that acts.
+        now: where things stand.
+        slots: how many, in each environment.
+    """
+    fresh = policy.initial()
+    count = len(now.start)
+
+    def one(now: Play, key: PRNGKeyArray) -> tuple[Play, Trajectory]:
+        choose, move = jax.random.split(key)
+        memory = jnp.where(now.start[:, None, None], fresh, now.memory)
+        memory, logit = jax.vmap(policy)(memory, now.observation)
+        action = act(choose, logit)
+        state, result = jax.vmap(environment.step)(jax.random.split(move, count), now.state, action)
+        record = Trajectory(
+            now.observation, now.start, action, logit, result.reward, result.truncated, result.slot
+        )
+        return Play(state, result.observation, memory, result.truncated | result.terminated), record
+
+    return jax.lax.scan(one, now, jax.random.split(key, slots))
+
+
+class Metrics(NamedTuple):
+    """Averages of one environment.
+
+    Attributes:
+        throughput: packets delivered per slot.
+        overflow: packets lost per device and slot.
+        reward: per slot.
+    """
+
+    throughput: Float[Array, " environment"]
+    overflow: Float[Array, " environment"]
+    reward: Float[Array, " environment"]
+
+
+@eqx.filter_jit
+def evaluate(
+    key: PRNGKeyArray,
+    environment: Environment,
+    policy: Policy,
+    slots: int,
+    count: int,
+) -> Metrics:
+    """Averages over one long episode in each of several environments.
+
+    With the same key all policies meet the same arrivals, as long as these do not depend on what is sent.
+
+    Args:
+        key: typed JAX key.
+        environment: the network.
+        policy: to judge.
+        slots: of an episode; the environment's horizon should not be shorter.
+        count: environments.
+    """
+    first, rest = jax.random.split(key)
+    now = begin(first, environment, policy, count)
+
+    def one(carry: tuple[Play, Metrics], key: PRNGKeyArray) -> tuple[tuple[Play, Metrics], None]:
+        now, sums = carry
+        now, got = play(key, environment, policy, now, 1)
+        slot = got.slot
+        new = (slot.delivered[0].sum(-1), slot.overflow[0].mean(-1), got.reward[0])
+        return (now, Metrics(*(total + value for total, value in zip(sums, new, strict=True)))), None
+
+    zero = jnp.zeros(count)
+    (_, sums), _ = jax.lax.scan(one, (now, Metrics(zero, zero, zero)), jax.random.split(rest, slots))
+    return Metrics(*(total / slots for total in sums))

@@ -1,0 +1,107 @@
+"""Policies see only what is theirs, remember only their episode, and survive export."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dtprob.control import FramePolicy, HistoryPolicy, TablePolicy, aloha, evaluate, tabulate, tdma
+from dtprob.control.environment import Observation
+from dtprob.control.export import load, save
+from dtprob.control.policy import unroll
+from dtprob.control.rollout import begin, play
+from dtprob.errors import InputError
+from dtprob.physical.multi_access import average, chain
+from tests.unit.control.networks import NETWORK, PAIR, world
+
+KEY = jax.random.key(0)
+
+
+def observations(slots, devices=4, seed=0):
+    draw = np.random.default_rng(seed).integers(0, 2, (4, slots, devices))
+    return Observation(*(jnp.asarray(part) for part in draw), slot=jnp.arange(slots))
+
+
+@pytest.mark.parametrize("kind", [FramePolicy, HistoryPolicy])
+def test_no_device_sees_another(kind):
+    policy, seen = kind(KEY, 4), observations(12)
+    start = jnp.zeros(12, bool)
+    logit = unroll(policy, policy.initial(), seen, start)[1]
+    other = seen._replace(
+        **{name: getattr(seen, name).at[:, 2].add(1) for name in ("buffer", "arrival", "ack")}
+    )
+    changed = unroll(policy, policy.initial(), other, start)[1] != logit
+    assert changed[:, 2].all()
+    assert not changed[:, [0, 1, 3]].any()
+
+
+def test_a_history_begins_with_its_episode():
+    policy, seen = HistoryPolicy(KEY, 4), observations(12)
+    logit = unroll(policy, policy.initial(), seen, jnp.arange(12) == 7)[1]
+    later = jax.tree.map(lambda leaf: leaf[7:], seen)
+    fresh = unroll(policy, policy.initial(), later, jnp.zeros(5, bool))[1]
+    np.testing.assert_allclose(logit[7:], fresh, rtol=1e-6)
+    kept = unroll(policy, policy.initial(), seen, jnp.zeros(12, bool))[1]
+    assert np.all(np.abs(kept[7:] - fresh) > 1e-6)
+
+
+@pytest.mark.parametrize("kind", [FramePolicy, HistoryPolicy])
+def test_log_odds_of_a_replay_are_those_of_the_play(kind):
+    policy, environment = kind(KEY, 2), world(PAIR, horizon=7)
+    now = begin(KEY, environment, policy, 3)
+    played = play(KEY, environment, policy, now, 20)[1]
+    logit = jax.vmap(unroll, (None, 0, 1, 1), (0, 1))(policy, now.memory, played.observation, played.start)[1]
+    np.testing.assert_allclose(logit, played.logit, rtol=1e-6, atol=1e-9)
+    assert played.start[:, 0].tolist() == [slot % 7 == 0 for slot in range(20)]
+
+
+def test_fixed_rules_deliver_what_the_exact_averages_say():
+    environment = world(NETWORK, horizon=10**6)
+    for policy in (tdma(4, 1, [[0, 1], [2, 3]]), aloha(4, 1, 0.25)):
+        exact = average(chain(NETWORK), np.asarray(policy.probability))
+        got = evaluate(KEY, environment, policy, 500, 300)
+        for value, law in zip(got, exact, strict=True):
+            # Slots from the empty start on: 20 of 500 may be off by the whole value, 4 standard errors besides.
+            error = 4 * np.std(value) / np.sqrt(len(value)) + 0.01 * abs(law)
+            assert abs(np.mean(value) - law) < error
+
+
+def test_a_table_sends_as_the_network_it_was_made_from(tmp_path):
+    policy = FramePolicy(KEY, 4)
+    save(tabulate(policy, 1), tmp_path / "policy.json")
+    table = load(tmp_path / "policy.json")
+    seen = observations(16)
+    start = jnp.zeros(16, bool)
+    ours = unroll(policy, policy.initial(), seen, start)[1]
+    theirs = unroll(table, table.initial(), seen, start)[1]
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5, atol=1e-6)
+    assert np.array_equal(table.probability, tabulate(policy, 1).probability)
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        "nothing",
+        "{}",
+        json.dumps({"format": "dtprob policy table 1", "probability": [[[[[2.0, 0], [0, 0]]]]]}),
+    ],
+)
+def test_what_is_no_table_is_refused(tmp_path, content):
+    (tmp_path / "policy.json").write_text(content)
+    with pytest.raises(InputError, match="Write it with save"):
+        load(tmp_path / "policy.json")
+    with pytest.raises(InputError, match="FileNotFoundError"):
+        load(tmp_path / "missing.json")
+
+
+def test_policies_meet_the_same_arrivals():
+    environment = world(NETWORK, horizon=10**6)
+    seen = []
+    for chance in (0.1, 0.9):
+        policy = aloha(4, 1, chance)
+        now = begin(KEY, environment, policy, 2)
+        seen.append(play(KEY, environment, policy, now, 30)[1].observation.arrival)
+    assert np.array_equal(*seen)
+    assert isinstance(policy, TablePolicy)
