@@ -28,7 +28,7 @@ def summary(
     the central interval; for an angle of the shortest arc, counter-clockwise from low to high),
     `resultant_length` (angles only), `ess` (bulk effective sample size) and `rhat` (rank-normalised; for an
     angle the worse of its cosine's and sine's, which a chain stuck on one side of +-pi cannot hide from
-    both).
+    both). An entry without a finite draw, such as the log-probability of what cannot happen, has no row.
 
     Args:
         posterior: the posterior.
@@ -61,6 +61,8 @@ def _rows(posterior: Posterior, name: str, probability: float) -> Iterable[tuple
         for index in np.ndindex(part.shape[2:]):
             place = f"[{','.join(map(str, index))}]" if index else ""
             entry = part[(slice(None), slice(None), *index)]
+            if not np.isfinite(entry).any():
+                continue
             row = _circular if name in posterior.circular else _linear
             yield f"{label}{place}", row(entry, probability)
 

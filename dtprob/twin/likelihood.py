@@ -52,19 +52,32 @@ def window_likelihoods(
         if axis not in own:
             remedy = "Name the axis of the windows"
             raise InputError(f"windows of {name!r}", f"one of {', '.join(own)}", repr(axis), remedy)
+    latent = {name: jnp.asarray(draws[name]) for name in declaration.latent}
     arrays, static = split_static(data)
-
-    @jax.jit
-    def run(values: Mapping[str, Array], arrays: Any) -> dict[str, Array]:
-        def one(value: Mapping[str, Array]) -> dict[str, Array]:
-            fixed = handlers.substitute(handlers.seed(model, jax.random.key(0)), data=dict(value))
-            terms, _ = compute_log_probs(fixed, (), eqx.combine(arrays, static), {}, sum_log_prob=False)
-            return {name: _summed(terms[name], own, str(axis), apart) for name, own in axes.items()}
-
-        return jax.lax.map(one, values, batch_size=_BATCH)
-
-    found = run({name: jnp.asarray(draws[name]) for name in declaration.latent}, arrays)
+    arrays = jax.tree.map(jnp.asarray, arrays)
+    found = _likelihoods(latent, arrays, static, model, axes, window=str(axis), apart=tuple(apart))
     return {label: part for name, value in found.items() for label, part in _parts(name, np.asarray(value))}
+
+
+@eqx.filter_jit
+def _likelihoods(
+    latent: Mapping[str, Array],
+    arrays: Mapping[str, Any],
+    static: Mapping[str, Any],
+    model: Model,
+    axes: Mapping[str, tuple[str, ...]],
+    *,
+    window: str,
+    apart: tuple[str, ...],
+) -> dict[str, Float[Array, "draw window *part"]]:
+    """One draw after another, a few at a time; compiled once per model and shapes."""
+
+    def one(value: Mapping[str, Array]) -> dict[str, Array]:
+        fixed = handlers.substitute(handlers.seed(model, jax.random.key(0)), data=dict(value))
+        terms, _ = compute_log_probs(fixed, (), eqx.combine(arrays, static), {}, sum_log_prob=False)
+        return {name: _summed(terms[name], own, window, apart) for name, own in axes.items()}
+
+    return jax.lax.map(one, latent, batch_size=_BATCH)
 
 
 def _summed(term: Array, axes: tuple[str, ...], window: str, apart: Sequence[str]) -> Array:

@@ -1,0 +1,222 @@
+"""What if: the average effect of another policy or another network, and what a logged episode would have been.
+
+The first is an intervention: both arms run anew, with the same luck, under each draw of the parameters. The second is
+about one episode that happened: its luck is drawn given its log (abduction), and the episode runs again with it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple, Protocol, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
+
+from dtprob.errors import InputError
+from dtprob.inference.posterior import Sampler
+from dtprob.models.multi_access.abduction import Transition, abduct
+from dtprob.models.multi_access.transition import Kernel, State
+from dtprob.twin.predict import sampled
+from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, rollout
+
+SITES = ("log_arrival", "log_reception")
+
+
+def unchanged(parameters: Parameters) -> Parameters:
+    """The learned network."""
+    return parameters
+
+
+class Arm(NamedTuple):
+    """What an intervention sets.
+
+    Attributes:
+        policy: what the devices do.
+        change: the network that is set in the place of the learned one, from its parameters; none by default.
+        kernel: the transition that is set; the learned network's by default.
+    """
+
+    policy: Policy
+    change: Callable[[Parameters], Parameters] = unchanged
+    kernel: Steps | None = None
+
+
+@final
+@dataclass(frozen=True)
+class Effect:
+    """The difference that an intervention makes.
+
+    Attributes:
+        differences: of the metric, alternative less baseline, in episodes of the same luck, (draw, episode).
+    """
+
+    differences: Float[np.ndarray, "draw episode"]
+
+    @property
+    def average(self) -> float:
+        """The average treatment effect."""
+        return float(self.differences.mean())
+
+    def interval(self, level: float = 0.9) -> tuple[float, float]:
+        """Credible limits of the average treatment effect, over draws of the parameters."""
+        if not 0 < level < 1:
+            raise InputError("level of an interval", "between 0 and 1", f"{level:g}", "Correct it")
+        tail = (1 - level) / 2
+        low, high = np.quantile(self.differences.mean(axis=1), [tail, 1 - tail])
+        return float(low), float(high)
+
+
+def average_effect(
+    key: PRNGKeyArray,
+    kernel: Steps,
+    sampler: Sampler,
+    *,
+    baseline: Arm,
+    alternative: Arm,
+    metric: Metric,
+    horizon: int,
+    draws: int = 200,
+    episodes: int = 20,
+    sites: tuple[str, ...] = SITES,
+) -> Effect:
+    """The average effect of an intervention on model or policy.
+
+    Args:
+        key: typed JAX key.
+        kernel: the network.
+        sampler: of its parameters.
+        baseline: what is compared with.
+        alternative: what is set instead.
+        metric: from slots to a number.
+        horizon: slots of an episode.
+        draws: of the parameters.
+        episodes: under each draw; both arms have the same luck.
+        sites: the parameters that the kernel takes.
+
+    Raises:
+        InputError: the sampler lacks a site.
+    """
+    parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
+    keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
+
+    arms = (baseline, alternative)
+    return Effect(np.asarray(_differences(keys, parameters, kernel, arms, metric, horizon=horizon), float))
+
+
+@eqx.filter_jit
+def _differences(
+    keys: PRNGKeyArray,
+    parameters: Parameters,
+    kernel: Steps,
+    arms: tuple[Arm, Arm],
+    metric: Metric,
+    *,
+    horizon: int,
+) -> Float[Array, "draw episode"]:
+    """Metric of the second arm less that of the first."""
+
+    def one(key: PRNGKeyArray, chosen: Parameters) -> Float[Array, ""]:
+        before, after = (
+            metric(rollout(key, arm.kernel or kernel, arm.change(chosen), arm.policy, horizon))
+            for arm in arms
+        )
+        return after - before
+
+    return jax.vmap(jax.vmap(one, in_axes=(0, None)))(keys, parameters)
+
+
+class LogLike(Protocol):
+    """An episode of a network's log."""
+
+    @property
+    def buffer(self) -> Int[np.ndarray, "slot device"]: ...  # noqa: D102
+
+    @property
+    def action(self) -> Int[np.ndarray, "slot device"]: ...  # noqa: D102
+
+    @property
+    def ack(self) -> Int[np.ndarray, "slot device"]: ...  # noqa: D102
+
+    @property
+    def arrival(self) -> Int[np.ndarray, "slot device"]: ...  # noqa: D102
+
+
+def transitions(episode: LogLike) -> Transition:
+    """The slots of one logged episode, each field (slot, device); nothing arrived before the first."""
+    arrival, ack = (jnp.asarray(x, jnp.int32) for x in (episode.arrival, episode.ack))
+    before = [jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]]) for x in (arrival, ack)]
+    state = State(jnp.asarray(episode.buffer, jnp.int32), *before, jnp.arange(len(arrival), dtype=jnp.int32))
+    return Transition(state, jnp.asarray(episode.action, jnp.int32), ack, arrival)
+
+
+def what_if(
+    key: PRNGKeyArray,
+    kernel: Kernel,
+    sampler: Sampler,
+    episode: LogLike,
+    *,
+    policy: Policy | None = None,
+    change: Callable[[Parameters], Parameters] = unchanged,
+    draws: int = 100,
+) -> Any:
+    """What a logged episode would have been under another policy or in a changed network.
+
+    For each draw of the parameters the luck of every slot is drawn given what happened, and the episode runs again from
+    its first state with that luck. With the logged actions in the learned network it is the logged episode, exactly.
+
+    Args:
+        key: typed JAX key.
+        kernel: the network.
+        sampler: of its parameters, best a posterior that knows the episode.
+        episode: its log.
+        policy: what the devices would have done; the logged actions by default.
+        change: the network that would have been, from the learned parameters.
+        draws: of parameters and luck.
+
+    Returns:
+        The slots, each field (draw, slot, ...).
+
+    Raises:
+        InputError: an episode that could not happen under a draw of the parameters.
+    """
+    parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, SITES)
+    happened = transitions(episode)
+
+    keys = jax.random.split(jax.random.fold_in(key, 1), draws)
+    slots, could = _replayed(keys, happened, parameters, kernel, policy, change=change)
+    if not bool(jnp.all(could)):
+        draw, slot = (int(i) for i in np.argwhere(~np.asarray(could))[0])
+        remedy = "Learn the parameters from this log too"
+        raise InputError("episode", "slots that can happen", f"slot {slot} under draw {draw}", remedy)
+    return slots
+
+
+@eqx.filter_jit
+def _replayed(
+    keys: PRNGKeyArray,
+    happened: Transition,
+    parameters: Parameters,
+    kernel: Kernel,
+    policy: Policy | None,
+    *,
+    change: Callable[[Parameters], Parameters],
+) -> tuple[Any, Bool[Array, "draw slot"]]:
+    """The episode of each draw, and which slots could happen under it."""
+
+    def run(key: PRNGKeyArray, chosen: Parameters) -> tuple[Any, Bool[Array, " slot"]]:
+        own = jax.random.split(key, (2, len(happened.action)))
+        noise, could = jax.vmap(lambda k, slot: abduct(kernel, k, chosen, slot))(own[0], happened)
+        changed = change(chosen)
+
+        def one(state: Any, given: tuple[Any, Array, PRNGKeyArray]) -> tuple[Any, Any]:
+            luck, action, act = given
+            return kernel.respond(luck, changed, state, action if policy is None else policy(act, state))
+
+        first = jax.tree.map(lambda x: x[0], happened.state)
+        return jax.lax.scan(one, first, (noise, happened.action, own[1]))[1], could
+
+    return jax.vmap(run)(keys, parameters)

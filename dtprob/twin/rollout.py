@@ -1,0 +1,73 @@
+"""Running a network under a policy: what prediction and counterfactuals share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int, PRNGKeyArray
+
+type Parameters = Mapping[str, Array]
+type Policy = Callable[[PRNGKeyArray, Any], Int[Array, " device"]]
+"""From a key and the state at the start of a slot to each device's action."""
+type Metric = Callable[[Any], Float[Array, ""]]
+"""From the slots of an episode, each field (slot, ...), to a number."""
+
+
+class Steps(Protocol):
+    """A network's transition in pure JAX."""
+
+    @property
+    def devices(self) -> int:
+        """Number of devices."""
+        ...
+
+    def initial(self) -> Any:
+        """The state at the start of an episode."""
+        ...
+
+    def step(
+        self, key: PRNGKeyArray, parameters: Any, state: Any, action: Int[Array, " device"]
+    ) -> tuple[Any, Any]:
+        """One slot: the next state, and what happened."""
+        ...
+
+
+def rollout(key: PRNGKeyArray, kernel: Steps, parameters: Parameters, policy: Policy, horizon: int) -> Any:
+    """The slots of one episode, each field (slot, ...).
+
+    Args:
+        key: typed JAX key.
+        kernel: the network.
+        parameters: of its transition.
+        policy: what the devices do.
+        horizon: slots.
+    """
+
+    def one(state: Any, key: PRNGKeyArray) -> tuple[Any, Any]:
+        act, move = jax.random.split(key)
+        return kernel.step(move, parameters, state, policy(act, state))
+
+    return jax.lax.scan(one, kernel.initial(), jax.random.split(key, horizon))[1]
+
+
+def throughput(slots: Any) -> Float[Array, ""]:
+    """Mean number of packets delivered per slot."""
+    return jnp.mean(jnp.sum(slots.delivered, axis=-1, dtype=float))
+
+
+def overflow(slots: Any) -> Float[Array, ""]:
+    """Mean number of packets lost to full buffers per device and slot."""
+    return jnp.mean(jnp.asarray(slots.overflow, float))
+
+
+def random_access(devices: int, probability: float | Array) -> Policy:
+    """Slotted ALOHA: each device with a packet transmits with this probability."""
+
+    def act(key: PRNGKeyArray, state: Any) -> Int[Array, " device"]:
+        chosen = jax.random.bernoulli(key, probability, (devices,))
+        return (chosen & (state.buffer > 0)).astype(jnp.int32)
+
+    return act

@@ -1,0 +1,113 @@
+"""Counterfactuals: the logged policy gives the logged episode; noise given a log has the noise's law; average effects."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from dtprob.errors import InputError
+from dtprob.inference import PointMass
+from dtprob.inference.exact import DirichletTables
+from dtprob.models.multi_access import kernel, priors, records, window_counts
+from dtprob.models.multi_access.abduction import Transition, abduct
+from dtprob.twin.counterfactual import Arm, average_effect, transitions, what_if
+from dtprob.twin.rollout import random_access, throughput
+from tests.small_network import CLUSTERS, simulate
+
+SYSTEM = kernel(CLUSTERS)
+
+
+@pytest.fixture(scope="module")
+def log():
+    return simulate(80, 20)
+
+
+@pytest.fixture(scope="module")
+def posterior(log):
+    arguments = records(log, clusters=CLUSTERS)
+    counts = {name: value.sum(axis=0) for name, value in window_counts(arguments).items()}
+    return DirichletTables(priors(arguments["clusters"], 0.5)).updated(counts)
+
+
+def test_the_logged_actions_give_back_the_logged_episode(log, posterior):
+    slots = what_if(jax.random.key(0), SYSTEM, posterior, log, draws=30)
+    assert np.array_equal(slots.delivered, np.broadcast_to(log.ack, (30, 80, 4)))
+    lost = (log.buffer + log.arrival - log.ack) > 1
+    assert np.array_equal(slots.overflow, np.broadcast_to(lost, (30, 80, 4)))
+
+
+def test_another_policy_changes_what_it_touches_only(log, posterior):
+    action = jnp.asarray(log.action).at[40:].set(0)
+
+    def silent_later(key, state):
+        return action[state.slot]
+
+    slots = what_if(jax.random.key(1), SYSTEM, posterior, log, policy=silent_later, draws=10)
+    assert np.array_equal(slots.delivered[:, :40], np.broadcast_to(log.ack[:40], (10, 40, 4)))
+    assert not np.any(slots.delivered[:, 40:])
+
+
+def test_noise_given_what_happened_is_uniform_over_slots(posterior):
+    """Noise drawn, slot run, noise drawn anew given the slot: its law is the prior's. Fails once in 10^4 keys."""
+    parameters = {
+        name: jnp.asarray(value[0]) for name, value in posterior.sample(jax.random.key(2), 1).items()
+    }
+    state = SYSTEM.initial()._replace(buffer=jnp.array([1, 1, 1, 0], jnp.int32))
+    action = jnp.array([1, 1, 1, 1], jnp.int32)
+
+    def again(key):
+        draw, anew = jax.random.split(key)
+        after, slot = SYSTEM.step(draw, parameters, state, action)
+        happened = Transition(state, action, slot.delivered, after.arrival)
+        noise, could = abduct(SYSTEM, anew, parameters, happened)
+        return jnp.concatenate([noise.arrival, noise.reception[None], noise.rank]), could
+
+    values, could = jax.jit(jax.vmap(again))(jax.random.split(jax.random.key(3), 4000))
+    assert np.all(could)
+    for column in np.asarray(values).T:
+        assert stats.kstest(column, "uniform").pvalue > 1e-4 / 7
+    correlation = np.corrcoef(np.asarray(values).T) - np.eye(7)
+    assert np.abs(correlation).max() < 5 / np.sqrt(4000)
+
+
+def test_an_episode_that_cannot_happen_is_named(log, posterior):
+    impossible = {name: np.where(value[0] > -1e9, value[0], -np.inf) for name, value in posterior.sample(
+        jax.random.key(4), 1).items()}  # fmt: skip
+    impossible["log_arrival"] = np.log(np.broadcast_to([1.0, 1e-300, 1e-300, 1e-300], (2, 1, 4)))
+    slot = int(np.flatnonzero(log.arrival.any(axis=1))[0])
+    with pytest.raises(InputError, match=f"slots that can happen, got slot {slot} under draw 0"):
+        what_if(jax.random.key(0), SYSTEM, PointMass(impossible), log, draws=2)
+
+
+def test_the_average_effect_of_silence_is_minus_the_throughput(posterior):
+    arms = Arm(random_access(4, 0.25)), Arm(random_access(4, 0.0))
+    given = {"metric": throughput, "horizon": 50, "draws": 20, "episodes": 4}
+    found = average_effect(
+        jax.random.key(5), SYSTEM, posterior, baseline=arms[0], alternative=arms[1], **given
+    )
+    low, high = found.interval()
+    assert low <= found.average <= high < 0
+    same = average_effect(
+        jax.random.key(5), SYSTEM, posterior, baseline=arms[0], alternative=arms[0], **given
+    )
+    assert not np.any(same.differences)
+
+
+def test_the_effect_of_another_network(posterior):
+    def perfect(parameters):
+        count = jnp.arange(5)
+        return {**parameters, "log_reception": jnp.where(count == count[:, None], 0.0, -jnp.inf)}
+
+    base = Arm(random_access(4, 1.0))
+    found = average_effect(
+        jax.random.key(6), SYSTEM, posterior, baseline=base, alternative=base._replace(change=perfect),
+        metric=throughput, horizon=100, draws=10, episodes=4,
+    )  # fmt: skip
+    assert found.interval()[0] > 0.2
+
+
+def test_transitions_carry_the_slot_before(log):
+    happened = transitions(log)
+    assert np.array_equal(happened.state.ack[1:], log.ack[:-1])
+    assert not np.any(np.asarray(happened.state.arrival[0]))

@@ -1,0 +1,89 @@
+"""A monitor on any model and sampler: likelihoods, thresholds, which factor changed."""
+
+import jax
+import numpy as np
+import pytest
+
+from dtprob.errors import InputError
+from dtprob.inference.exact import DirichletTables
+from dtprob.models.dirichlet import log_shares
+from dtprob.models.multi_access import multi_access, priors, records, window_counts
+from dtprob.twin.likelihood import table_likelihoods, window_likelihoods
+from dtprob.twin.monitor import Monitor
+from tests.small_network import CLUSTERS, RECEPTION, simulate
+
+
+def windows(log):
+    return records(log, clusters=CLUSTERS, window=10)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    arguments = windows(simulate(300, 10))
+    counts = {name: value.sum(axis=0) for name, value in window_counts(arguments).items()}
+    prior = DirichletTables(priors(arguments["clusters"], 0.5))
+    return prior, prior.updated(counts), counts
+
+
+@pytest.fixture(scope="module")
+def monitor(learned):
+    prior, posterior, _ = learned
+    draws, changed = (law.sample(jax.random.key(i), 100) for i, law in enumerate((posterior, prior)))
+    plain = Monitor(multi_access, draws, changed, "evidence", apart=("cluster",), rate=0.1, run_length=500.0)
+    return plain.calibrated(windows(simulate(400, 11)))
+
+
+def test_likelihoods_are_those_of_the_counts(learned):
+    arguments = windows(simulate(45, 12))
+    draws = learned[1].sample(jax.random.key(2), 5)
+    counted = table_likelihoods(window_counts(arguments), draws)
+    found = window_likelihoods(multi_access, arguments, draws, apart=("cluster",))
+    arrivals = found["arrivals[0]"] + found["arrivals[1]"]
+    np.testing.assert_allclose(arrivals, counted["log_arrival"], rtol=1e-6)
+    np.testing.assert_allclose(found["deliveries"], counted["log_reception"], rtol=1e-6, atol=1e-9)
+
+
+def test_normal_data_seldom_alarm(monitor):
+    watch = monitor.watch(windows(simulate(400, 13)))
+    assert watch.alarm.mean() < 0.1 + 4 * np.sqrt(0.1 * 0.9 * (1 / 40 + 1 / 40))
+    assert watch.detected is None
+    assert watch.changed is None
+
+
+@pytest.mark.parametrize(
+    ("change", "factor"),
+    [
+        ({"silent": (1,)}, "arrivals[0]"),
+        ({"silent": (2,)}, "arrivals[1]"),
+        ({"reception": {**RECEPTION, 1: [0.5, 0.5], 2: [0.6, 0.4, 0.0]}}, "deliveries"),
+    ],
+)
+def test_a_change_is_found_and_its_factor_named(monitor, change, factor):
+    watch = monitor.watch(windows(simulate(400, 14, **change)))
+    assert watch.detected is not None
+    assert watch.detected < 20
+    assert watch.changed == factor
+    assert watch.factors[factor] > 0.9
+
+
+def test_the_frequentist_is_one_draw(learned):
+    _, _, counts = learned
+    mask = {name: value > 0 for name, value in priors(windows(simulate(10, 0))["clusters"], 1.0).items()}
+    point = {name: log_shares(value + 0.01, mask[name])[None] for name, value in counts.items()}
+    rival = Monitor(multi_access, point, rate=0.1).calibrated(windows(simulate(200, 11)))
+    watch = rival.watch(windows(simulate(200, 14, silent=(1,))))
+    assert watch.evidence == {}
+    assert watch.detected is None
+    assert watch.alarm.mean() > 0.2
+
+
+def test_what_cannot_be_watched_is_refused(monitor, learned):
+    with pytest.raises(InputError, match="expected one that is calibrated"):
+        Monitor(multi_access, monitor.draws).watch(windows(simulate(20, 0)))
+    with pytest.raises(InputError, match="Did you mean 'surprise'"):
+        Monitor(multi_access, monitor.draws, statistic="suprise")
+    with pytest.raises(InputError, match="draws of what a change may bring"):
+        Monitor(multi_access, monitor.draws, statistic="evidence")
+    few = {"log_arrival": monitor.draws["log_arrival"]}
+    with pytest.raises(InputError, match="every latent site of multi_access, got no 'log_reception'"):
+        window_likelihoods(multi_access, windows(simulate(20, 0)), few)
