@@ -12,7 +12,6 @@ this one works on the target itself; densities and normal draws are NumPyro's, t
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -49,6 +48,7 @@ _SHRINK = 0.25
 _CLIP = 100.0  # nats per unit of a parameter
 _LARGEST_FULL = 100
 _TRIALS = 64
+_FEWEST = 25  # draws that a tail can be told from
 _SAME = 1e-6  # nats between log weights that are told from rounding
 _EVALUATED = 32  # draws whose weights are evaluated at once
 
@@ -80,8 +80,9 @@ class SVI(AbstractEngine):
     The posterior's `extra` has `elbo` (evidence lower bound, nats) with its `elbo_history`, `converged`
     (whether the bound stopped rising at every rate), `pareto_k` (the tail index of the importance weights:
     above 0.7 the guide misses part of the posterior, and its draws are not to be trusted; minus infinity
-    where all weights are equal), `log_evidence` (from these weights) and `concentration.<site>` for each
-    circular site. The statistic `log_weight` is log posterior less log guide, for weighing draws anew.
+    where all weights are equal, nan of fewer than 25 draws), `log_evidence` (from these weights) and
+    `concentration.<site>` for each circular site. The statistic `log_weight` is log posterior less log guide,
+    for weighing draws anew.
 
     Attributes:
         draws: how many draws of the guide.
@@ -206,13 +207,12 @@ def weight_facts(log_weight: Float[np.ndarray, " draw"]) -> dict[str, Any]:
     from arviz_stats.base import array_stats  # noqa: PLC0415  (takes a second)
 
     evidence = float(logsumexp(log_weight) - np.log(log_weight.size))
+    if log_weight.size < _FEWEST:
+        return {"pareto_k": np.nan, "log_evidence": evidence}
     if np.ptp(log_weight) < _SAME:
         return {"pareto_k": -np.inf, "log_evidence": evidence}
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of too few draws for a tail: the index is infinite then
-        _, index = array_stats.psislw(
-            -log_weight
-        )  # which takes minus the log weights, as of a likelihood left out
+    # It takes minus the log weights, as of a likelihood that is left out.
+    _, index = array_stats.psislw(-log_weight)
     return {"pareto_k": float(index), "log_evidence": evidence}
 
 

@@ -2,16 +2,15 @@
 
 import jax
 import numpy as np
-import numpyro
-import numpyro.distributions as dist
 import pytest
 from arviz_stats.base import array_stats
 from scipy import stats
 
-from dtprob.inference import NUTS, BlackJAXNUTS, Laplace, RunOptions
+from dtprob.inference import NUTS, SMC, SVI, BlackJAXNUTS, Ensemble, Exact, Laplace, RunOptions
+from dtprob.testing.calibration import CASES, DRAWS, judge, simulated_ranks
 from tests.unit.inference.examples import logistic, logistic_data
 
-RUNS, RANKS, RATE = 120, 20, 1e-3
+RATE = 1e-3
 LEAN = RunOptions(pointwise=False, deterministics=False)
 
 
@@ -37,59 +36,35 @@ def test_the_two_nuts_agree():
     assert np.max(np.abs(scores)) < limit
 
 
-def normal(x, y=None):
-    level = numpyro.sample("level", dist.Normal(1.0, 2.0))
-    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
-    with numpyro.plate("row", 6):
-        numpyro.sample("y", dist.Normal(level + slope * x, 1.0), obs=y)
-
-
-def spread(x, y=None):
-    scale = numpyro.sample("scale", dist.LogNormal(0.0, 0.5))
-    angle = numpyro.sample("angle", dist.VonMises(np.pi, 1.0))
-    with numpyro.plate("row", 6):
-        numpyro.sample("y", dist.Normal(scale * jax.numpy.cos(angle - x), 0.7), obs=y)
-
-
-def ranks(engine, model, thin):
-    """Rank of the true value among thinned draws, for every latent site, over runs on data from the prior."""
-    x = np.linspace(-1, 2, 6)
-    found = {}
-    for key in jax.random.split(jax.random.key(3), RUNS):
-        true_key, fit_key = jax.random.split(key)
-        trace = numpyro.handlers.trace(numpyro.handlers.seed(model, true_key)).get_trace(x)
-        truth = {n: np.asarray(m["value"]) for n, m in trace.items() if m["type"] == "sample"}
-        posterior = engine(fit_key, model, {"x": x, "y": truth["y"]}, options=LEAN)
-        for name in posterior.latent:
-            draws = posterior.draws[name].reshape(-1)[::thin][: RANKS - 1]
-            assert draws.size == RANKS - 1
-            # An angle is ranked from the cut of its prior, where there is least mass.
-            turn = (lambda z: np.mod(z, 2 * np.pi)) if name == "angle" else (lambda z: z)
-            found.setdefault(name, []).append(int(np.sum(turn(draws) < turn(truth[name]))))
-    return found
-
-
-CASES = {
-    "nuts": (NUTS(warmup=150, draws=95, chains=1), spread, 5),
-    "laplace on a normal": (Laplace(draws=19, starts=1), normal, 1),
+SHORT = {"warmup": 150, "draws": 95, "chains": 1}
+ENGINES = {
+    "nuts, circular": (NUTS(**SHORT), 120),
+    "blackjax_nuts, hierarchical": (BlackJAXNUTS(**SHORT), 120),
+    "smc, circular": (SMC(draws=190, chains=1, moves=3, leapfrog=5), 120),
+    "svi, normal": (SVI(draws=DRAWS, starts=1, falls=1, particles=4), 60),
+    "laplace, normal": (Laplace(draws=DRAWS, starts=1), 120),
+    "ensemble, normal": (Ensemble(members=DRAWS, starts=1), 120),
+    "exact, normal": (Exact(draws=DRAWS), 120),
 }
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", ENGINES)
 def test_ranks_are_uniform(name):
-    """Exact bounds: a bin count is binomial; the chi-square statistic is simulated from uniform ranks."""
-    engine, model, thin = CASES[name]
-    random = np.random.default_rng(0)
+    """Ranks of true values are even (simulated null) and 90% intervals hold them (exact), at the declared rate."""
+    engine, runs = ENGINES[name]
+    ranks = simulated_ranks(engine, CASES[name.split(", ")[1]], jax.random.key(3), runs)
+    for site, found in ranks.items():
+        verdict = judge(found)
+        assert verdict.p_value > RATE / len(ranks), site
+        assert verdict.coverage_p_value > RATE / len(ranks), site
 
-    def departure(values):
-        counts = np.bincount(values, minlength=RANKS)
-        return np.sum((counts - RUNS / RANKS) ** 2)
 
-    null = np.sort([departure(random.integers(0, RANKS, RUNS)) for _ in range(20_000)])
-    for site, found in ranks(engine, model, thin).items():
-        counts = np.bincount(found, minlength=RANKS)
-        low, high = stats.binom.interval(1 - RATE / RANKS, RUNS, 1 / RANKS)
-        assert low <= counts.min() <= counts.max() <= high, site
-        assert departure(np.asarray(found)) < np.quantile(null, 1 - RATE), site
-        halves = stats.binomtest(int(np.sum(np.asarray(found) < RANKS // 2)), RUNS, 0.5).pvalue
-        assert halves > RATE, site
+def test_a_wrong_posterior_is_found_out():
+    """Uniform ranks pass; those of draws that are too narrow, or too high, do not."""
+    ranks = np.random.default_rng(1).integers(0, DRAWS + 1, 60)
+    assert judge(ranks).p_value > RATE
+    assert judge(ranks).coverage_p_value > RATE
+    narrow = np.where(ranks < 8, 0, np.where(ranks > 11, DRAWS, ranks))
+    assert judge(narrow).p_value < RATE
+    assert judge(narrow).coverage_p_value < RATE
+    assert judge(np.maximum(ranks - 6, 0)).p_value < RATE

@@ -76,4 +76,5 @@ def test_weights_of_known_tails():
     uniform = np.random.default_rng(0).uniform(size=20_000)
     for index in (0.3, 0.9):
         assert weight_facts(-index * np.log(uniform))["pareto_k"] == pytest.approx(index, abs=0.15)
-    assert weight_facts(np.full(10, -3.0)) == {"pareto_k": -np.inf, "log_evidence": pytest.approx(-3.0)}
+    assert weight_facts(np.full(100, -3.0)) == {"pareto_k": -np.inf, "log_evidence": pytest.approx(-3.0)}
+    assert np.isnan(weight_facts(np.zeros(10))["pareto_k"])
