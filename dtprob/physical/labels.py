@@ -52,7 +52,7 @@ class Setting(NamedTuple):
 
     quality: Quality
     n: int
-    unlabelled: int
+    unlabelled: int | Float[Array, ""]
     folds: int
 
 
@@ -100,7 +100,7 @@ def _least_squares(x: Array, y: Array, weight: Array) -> Float[Array, " coeffici
 
 
 def _unlabelled(
-    key: PRNGKeyArray, count: int
+    key: PRNGKeyArray, count: int | Float[Array, ""]
 ) -> tuple[Float[Array, " feature"], Float[Array, "feature feature"]]:
     """Mean of the features, and their mean outer product around it, by Bartlett's decomposition."""
     keys = jax.random.split(key, 3)

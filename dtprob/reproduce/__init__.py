@@ -9,8 +9,10 @@ from typing import Final
 FIGURES: Final[Mapping[str, str]] = {
     "fig3": "dtprob.reproduce.fig3",
     "fig2": "dtprob.reproduce.fig2",
+    "prediction": "dtprob.reproduce.prediction",
     "fig9": "dtprob.reproduce.fig9",
     "fig10": "dtprob.reproduce.fig10",
     "label_grid": "dtprob.reproduce.label_grid",
+    "deepsense": "dtprob.reproduce.deepsense",
 }
 """For each figure's name, the module that makes it."""

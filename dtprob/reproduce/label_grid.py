@@ -6,6 +6,7 @@ those of ERM and CPPI, which should never exceed 1.02, and the coverage of its 9
 
 import itertools
 from collections.abc import Mapping
+from functools import partial
 from typing import Final, NamedTuple
 
 import jax
@@ -104,23 +105,33 @@ def study(key: PRNGKeyArray, runs: int, setting: Setting, practice: Practice = C
         setting: their kind.
         practice: conventions of tuning and intervals.
     """
+    shape = setting._replace(unlabelled=0)
+    found = _runs(jax.random.split(key, runs), jnp.asarray(float(setting.unlabelled)), shape, practice)
+    point, error, degrees, lam = (np.asarray(part) for part in found)
+    return Cell((point**2).mean(axis=0), _coverage(point, error, degrees, practice), lam.mean(axis=0))
+
+
+@partial(jax.jit, static_argnums=(2, 3))
+def _runs(
+    keys: PRNGKeyArray, count: Float[Array, ""], shape: Setting, practice: Practice
+) -> tuple[Array, Array, Array, Array]:
+    """Estimates, their standard errors and degrees of freedom, and lambda, each per run and scheme.
+
+    The number of unlabelled samples is an argument, so that cells that differ in it are compiled once.
+    """
 
     def one(own: PRNGKeyArray) -> tuple[Array, Array, Array, Array]:
-        evaluation = evaluation_of(label_study(own, setting), setting.unlabelled)
+        evaluation = evaluation_of(label_study(own, shape._replace(unlabelled=count)), count)
         tuned = tune(evaluation, jnp.ones((1, 1)), "overall", practice)
         lams = [fixed(0.0, evaluation).value, fixed(1.0, evaluation).value, tuned.value]
         rows = [_estimate(evaluation, lam, practice) for lam in lams]
         point, error, degrees = (jnp.stack(column) for column in zip(*rows, strict=True))
         return point, error, degrees, jnp.stack([lam[0, 0] for lam in lams])
 
-    def every(keys: PRNGKeyArray) -> tuple[Array, Array, Array, Array]:
-        return jax.lax.map(one, keys, batch_size=min(_BATCH, runs))
-
-    point, error, degrees, lam = (np.asarray(a) for a in jax.jit(every)(jax.random.split(key, runs)))
-    return Cell((point**2).mean(axis=0), _coverage(point, error, degrees, practice), lam.mean(axis=0))
+    return jax.lax.map(one, keys, batch_size=min(_BATCH, len(keys)))
 
 
-def evaluation_of(study: LabelStudy, count: int) -> Evaluation:
+def evaluation_of(study: LabelStudy, count: Float[Array, ""]) -> Evaluation:
     """The data of a study as the estimators see them: gradients of the mean's loss at 0."""
     one = jnp.ones((1, 1, 1))
 
@@ -135,7 +146,7 @@ def evaluation_of(study: LabelStudy, count: int) -> Evaluation:
         predicted_gradient=-study.prediction[:, None],
         context=jnp.zeros(len(study.y), int),
         n=jnp.asarray(float(len(study.y))),
-        n_unlabelled=jnp.asarray(float(count)),
+        n_unlabelled=count,
     )
 
 

@@ -20,7 +20,7 @@ def lambdas(quality, practice, *, runs=400, n=60, count=500):
     setting = Setting(quality, n, count, 5)
 
     def one(key):
-        evaluation = evaluation_of(label_study(key, setting), count)
+        evaluation = evaluation_of(label_study(key, setting), jnp.asarray(float(count)))
         return tune(evaluation, jnp.ones((1, 1)), "overall", practice)
 
     return jax.tree.map(np.ravel, jax.vmap(one)(jax.random.split(jax.random.key(5), runs)))
