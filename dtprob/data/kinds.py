@@ -5,7 +5,7 @@ All quantities are in SI units; the arrays are NumPy arrays in double precision 
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
-from typing import Any, final
+from typing import Any, Self, final
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float, Int
@@ -101,7 +101,7 @@ class ChannelData(_Checked):
         _check_array(self.rx_array, "rx_array", self.channel.shape[2])
         _check_array(self.tx_array, "tx_array", self.channel.shape[3])
 
-    def take(self, links: Int[np.ndarray, " chosen"]) -> "ChannelData":
+    def take(self, links: Int[np.ndarray, " chosen"]) -> Self:
         """The data of some links, in the order given.
 
         Args:
@@ -141,6 +141,21 @@ class PowerData(_Checked):
 
     def __post_init__(self) -> None:
         self._check(POWER_ARRAYS)
+
+    def take(self, links: Int[np.ndarray, " chosen"]) -> Self:
+        """The data of some links, in the order given.
+
+        Args:
+            links: indices of links.
+        """
+        noise = self.noise_power
+        return replace(
+            self,
+            power=self.power[links],
+            rx_position=self.rx_position[links],
+            tx_position=self.tx_position[links],
+            noise_power=noise[links] if noise is not None and np.ndim(noise) else noise,
+        )
 
 
 @final

@@ -115,7 +115,10 @@ def closed_fraction(
     return ClosedFraction(float(np.clip(centre, low, high)), float(low), float(high))
 
 
-def nmse_db(result: HeldOut) -> float | None:
-    """Normalised mean squared error of the prediction on held-out clusters, dB."""
+def error_db(problem: Problem, result: HeldOut) -> float | None:
+    """Error of the prediction on held-out clusters in dB: normalised mean square, of powers the root mean square."""
     total = float(result.signal.sum())
-    return None if total <= 0 else float(10 * np.log10(max(float(result.error.sum()) / total, 1e-300)))
+    if total <= 0:
+        return None
+    ratio = max(float(result.error.sum()) / total, 1e-300)
+    return float(np.sqrt(ratio) if problem.has_powers else 10 * np.log10(ratio))

@@ -15,6 +15,7 @@ from dtprob.gap.quick import quick_jit
 from dtprob.gap.running import Runner
 
 _CHUNK = 16
+_DECIBELS = 10.0 / np.log(10.0)
 
 
 @final
@@ -267,7 +268,10 @@ class Compiled:
 
     @cached_property
     def prediction_error(self) -> Any:
-        """X -> squared error and squared signal of each cluster (cluster,), over observations with a location."""
+        """X -> squared error and squared signal of each cluster (cluster,), over observations with a location.
+
+        For log-normal observations, as received powers are, the error is in dB and the signal counts entries.
+        """
 
         @quick_jit
         def prediction_error(x: Any, arrays: Any) -> tuple[jax.Array, jax.Array]:
@@ -275,9 +279,19 @@ class Compiled:
             error, signal = {}, {}
             for name, o in self._runner.observations(trace).items():
                 value, zero = trace[name]["value"], jnp.zeros(self._runner.shapes[name])
-                located = "loc" in o.parameters
-                error[name] = zero.at[0].set(jnp.abs(value - o.parameters["loc"]) ** 2) if located else zero
-                signal[name] = zero.at[0].set(jnp.abs(value) ** 2) if located else zero
+                if "loc" not in o.parameters:
+                    error[name], signal[name] = zero, zero
+                    continue
+                is_log = o.family == "LogNormal"
+                miss = (
+                    _DECIBELS * (jnp.log(value) - o.parameters["loc"])
+                    if is_log
+                    else value - o.parameters["loc"]
+                )
+                error[name] = zero.at[0].set(o.masked(jnp.abs(miss) ** 2))
+                signal[name] = zero.at[0].set(
+                    o.masked(jnp.ones_like(miss) if is_log else jnp.abs(value) ** 2)
+                )
             return self._runner.rows.stack(error).sum(1), self._runner.rows.stack(signal).sum(1)
 
         return lambda x: prediction_error(jnp.asarray(x), self._arrays)

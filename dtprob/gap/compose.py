@@ -114,10 +114,11 @@ def _gap(evidence: Evidence) -> dict[str, Any]:
     before = (best - float(evidence.held_before.log_likelihood.sum())) / n
     after = (best - float(evidence.held_after.log_likelihood.sum())) / n if evidence.accepted else None
     terms: dict[str, Any] = {}
-    error = closed.nmse_db(evidence.held_before)
+    problem = evidence.problem
+    error = closed.error_db(problem, evidence.held_before)
     if error is not None:
-        name = f"{next(iter(evidence.problem.declaration.observed))}_nmse_db"
-        terms[name] = [error, closed.nmse_db(evidence.held_after) if evidence.accepted else None]
+        name = f"{next(iter(problem.declaration.observed))}_{'rmse' if problem.has_powers else 'nmse'}_db"
+        terms[name] = [error, closed.error_db(problem, evidence.held_after) if evidence.accepted else None]
     return {
         "unit": "nats per observation",
         "before": before,

@@ -146,5 +146,7 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
 
 def _negligible(evidence: Evidence, settings: Settings) -> bool:
     """Whether the base model's held-out error is already below what the user cares about."""
-    error = closed.nmse_db(evidence.held_before)
-    return settings.tolerance_db is not None and error is not None and error <= -abs(settings.tolerance_db)
+    error, tolerance = closed.error_db(evidence.problem, evidence.held_before), settings.tolerance_db
+    if tolerance is None or error is None:
+        return False
+    return error <= (abs(tolerance) if evidence.problem.has_powers else -abs(tolerance))

@@ -151,6 +151,11 @@ class Problem:
         return {name: shape[0] for name, shape in self._runner.shapes.items()}
 
     @property
+    def has_powers(self) -> bool:
+        """Whether all that is observed is log-normal, as received powers are, so that its errors are in dB."""
+        return set(self._runner.families.values()) == {"LogNormal"}
+
+    @property
     def rows_per_observation(self) -> float:
         """Whitened rows per observed entry."""
         return len(self.rows.ids) / max(self.n_observation, 1)

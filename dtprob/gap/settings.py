@@ -22,7 +22,8 @@ class Settings:
         credibility: probability that a reported class of causes must hold.
         relevance: share of the gap that causes must close to count as its explanation.
         minor: a further effect must add this share of the evidence that the effects before it have brought.
-        tolerance_db: residual error, in dB below the signal, that the user does not care about; None for no tolerance.
+        tolerance_db: residual error that the user does not care about, in dB below the signal; of powers, their rms
+            error in dB. None for no tolerance.
     """
 
     level: float = 0.01

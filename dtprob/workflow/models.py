@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtprob.data import ChannelData, NetworkLog
+from dtprob.data import ChannelData, NetworkLog, PowerData
 from dtprob.models.declaration import Model
 
 
@@ -47,6 +47,11 @@ def _load(function: str) -> Callable[..., Any]:
 MODELS: Mapping[str, Entry] = {
     "phase_error_channel": Entry("dtprob.models.channel:phase_error_channel", ChannelData),
     "ray_traced_channel": Entry("dtprob.models.channel:ray_traced_channel", ChannelData),
+    "received_power": Entry(
+        "dtprob.models.received_power:received_power",
+        PowerData,
+        arrange="dtprob.models.received_power:link_power",
+    ),
     "ultra_wideband_channel": Entry(
         "dtprob.models.ultra_wideband:ultra_wideband_channel",
         ChannelData,

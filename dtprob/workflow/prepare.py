@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.case import Case, EngineSection
-from dtprob.data import ChannelData, Data, Table, read, read_table
+from dtprob.data import ChannelData, Data, PowerData, Table, read, read_table
 from dtprob.data.location import located
 from dtprob.effects import Effect, catalogue, summaries
 from dtprob.errors import InputError, unknown_name
@@ -164,7 +164,7 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
     else:
         data = read_table(file)
     paths = None
-    if needs_paths and isinstance(data, ChannelData):
+    if needs_paths and isinstance(data, ChannelData | PowerData):
         data, paths = reached(case, data, cache, say)
     arrange = MODELS[case.model.name].arranger() if case.model.name in MODELS else None
     columns = data.arrays() if arrange is None else _arranged(case, arrange, data)
@@ -173,17 +173,27 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
         arguments[case.data.cluster] = columns[case.data.cluster]
     if paths is not None:
         arguments["paths"] = paths
-    if case.data.phase is not None:
-        if "phase" in takes:
-            arguments["phase"] = case.data.phase
-        elif case.data.phase != "coherent":
-            expected = f"coherent phases, which {case.model.name} assumes"
-            remedy = "Choose a model that takes a phase, such as ray_traced_channel"
-            raise InputError(f"{case.path.name} [data] phase", expected, case.data.phase, remedy)
+    arguments |= _phase(case, data, takes="phase" in takes)
     if case.model.name in MODELS:
         arguments |= {name: jnp.asarray(v) for name, v in MODELS[case.model.name].derive(arguments).items()}
     own = [] if arrange is None else list(inspect.signature(arrange).parameters)[1:]
     return arguments | _options(case, takes, arguments, own)
+
+
+def _phase(case: Case, data: Data, *, takes: bool) -> dict[str, Any]:
+    """The argument that says what phases mean, if the case says it and the model takes it."""
+    phase = case.data.phase
+    if phase is None:
+        return {}
+    if takes:
+        return {"phase": phase}
+    if phase != ("none" if isinstance(data, PowerData) else "coherent"):
+        expected = f"coherent phases, which {case.model.name} assumes"
+        remedy = "Choose a model that takes a phase, such as ray_traced_channel"
+        if isinstance(data, PowerData):
+            expected, remedy = "none, since powers have no phase", 'Set phase = "none"'
+        raise InputError(f"{case.path.name} [data] phase", expected, phase, remedy)
+    return {}
 
 
 def _arranged(case: Case, arrange: Callable[..., dict[str, Any]], data: Data) -> dict[str, Any]:

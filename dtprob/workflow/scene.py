@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from dtprob.case import Case, SceneSection
-from dtprob.data import ChannelData
+from dtprob.data import ChannelData, PowerData
 from dtprob.data.location import located
 from dtprob.errors import InputError
 from dtprob.raytracing import storage
@@ -19,9 +19,9 @@ from dtprob.raytracing.paths import PathSet
 _WALL_THICKNESS = 0.12
 
 
-def reached(
-    case: Case, data: ChannelData, cache: Path | None, say: Callable[[str], None]
-) -> tuple[ChannelData, PathSet]:
+def reached[Links: ChannelData | PowerData](
+    case: Case, data: Links, cache: Path | None, say: Callable[[str], None]
+) -> tuple[Links, PathSet]:
     """The data and their path set, without the links that no path reaches where the case asks for that.
 
     Args:
@@ -47,7 +47,9 @@ def reached(
     return data.take(np.flatnonzero(found)), paths.take(found)
 
 
-def paths_of(case: Case, data: ChannelData, cache: Path | None, say: Callable[[str], None]) -> PathSet:
+def paths_of(
+    case: Case, data: ChannelData | PowerData, cache: Path | None, say: Callable[[str], None]
+) -> PathSet:
     """The path set of the data's links: read, taken from the cache, or traced.
 
     Args:
@@ -86,7 +88,7 @@ def _is_plan(scene: SceneSection) -> bool:
     return scene.file.lower().endswith(".json")
 
 
-def _placed(scene: SceneSection, data: ChannelData) -> ChannelData:
+def _placed[Links: ChannelData | PowerData](scene: SceneSection, data: Links) -> Links:
     """The data with the height that the case gives to both ends added to their positions."""
     if scene.device_height is None:
         return data
@@ -110,7 +112,7 @@ def _load(scene: SceneSection, frequency: float) -> Any:
     return floorplan_scene(plan.walls, scene.ceiling_height, frequency, wall=wall, furniture=plan.furniture)
 
 
-def _trace(scene: SceneSection, data: ChannelData) -> PathSet:
+def _trace(scene: SceneSection, data: ChannelData | PowerData) -> PathSet:
     from dtprob.raytracing.trace import trace  # noqa: PLC0415  (needs the ray tracer)
 
     frequency = float(scene.frequency or 0.0)
@@ -130,7 +132,7 @@ def _trace(scene: SceneSection, data: ChannelData) -> PathSet:
     )
 
 
-def _scene_hash(scene: SceneSection, data: ChannelData) -> str:
+def _scene_hash(scene: SceneSection, data: ChannelData | PowerData) -> str:
     """What a traced path set depends on, in 16 characters."""
     digest = hashlib.sha256(json.dumps(dataclasses.asdict(scene), sort_keys=True).encode())
     file = Path(scene.file)
@@ -141,7 +143,7 @@ def _scene_hash(scene: SceneSection, data: ChannelData) -> str:
     return digest.hexdigest()[:16]
 
 
-def _same_links(paths: PathSet, data: ChannelData, case: Case) -> PathSet:
+def _same_links(paths: PathSet, data: ChannelData | PowerData, case: Case) -> PathSet:
     for name in ("rx_position", "tx_position"):
         traced, measured = np.asarray(getattr(paths, name)), getattr(data, name)
         if traced.shape != measured.shape or not np.allclose(traced, measured, rtol=0.0, atol=1e-3):

@@ -46,7 +46,7 @@ def test_cross_fit_judges_each_cluster_by_the_others():
         np.testing.assert_allclose(found.log_likelihood[out], expected, atol=0.05)
         np.testing.assert_allclose(found.error[out], (residual**2).sum(1), atol=0.05)
     np.testing.assert_allclose(
-        closed.nmse_db(found), 10 * np.log10(found.error.sum() / (y**2).sum()), rtol=1e-9
+        closed.error_db(problem, found), 10 * np.log10(found.error.sum() / (y**2).sum()), rtol=1e-9
     )
 
 
