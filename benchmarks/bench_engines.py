@@ -212,7 +212,9 @@ def errors(posterior: Posterior, reference: Posterior) -> dict[str, Any]:
 
 
 def write(rows: list[dict[str, Any]]) -> None:
-    """Keep the table with what it takes to repeat it."""
+    """Keep the table with what it takes to repeat it; rows of models that were not run stay."""
+    old = json.loads(FILE.read_text())["rows"] if FILE.is_file() else []
+    done = {row["model"] for row in rows}
     result = {
         "benchmark": "cost (processor seconds) and error (standard deviations) of the engines",
         "command": shlex.join(["python", "benchmarks/bench_engines.py", *sys.argv[1:]]),
@@ -220,7 +222,7 @@ def write(rows: list[dict[str, Any]]) -> None:
         "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
         "versions": {name: version(name) for name in ("jax", "numpyro", "blackjax")},
         "settings": SETTINGS,
-        "rows": rows,
+        "rows": [row for row in old if row["model"] not in done] + rows,
     }
     FILE.write_text(json.dumps(result, indent=2) + "\n")
     print(f"written to {FILE.relative_to(Path.cwd()) if FILE.is_relative_to(Path.cwd()) else FILE}")

@@ -101,7 +101,8 @@ def _begin[S](job: Job, steps: Steps[S], wanted: dict[str, Any]) -> tuple[int, S
     if not job.options.resume or path is None or not path.exists():
         return 0, steps.begin(), []
     found = checkpoint.read(path, wanted)
-    state = checkpoint.restore(found.state, jax.eval_shape(steps.begin), f"checkpoint {path}")
+    # The first state is made again, for its shape: it may take a search, whose choices eval_shape cannot follow.
+    state = checkpoint.restore(found.state, steps.begin(), f"checkpoint {path}")
     return found.done, state, [found.draws] if found.draws else []
 
 

@@ -107,7 +107,7 @@ def _coins(concentration: float, y: Any = None) -> None:
     level = numpyro.deterministic("level", table[:, 1])
     numpyro.deterministic("doubled", 2 * jnp.asarray(level))
     with numpyro.plate("row", _ROWS, dim=-2), numpyro.plate("unit", _UNITS, dim=-1):
-        numpyro.sample(_OBSERVED, dist.Categorical(logits=table), obs=y)
+        numpyro.sample(_OBSERVED, dist.CategoricalLogits(table), obs=y)
 
 
 def _table_case() -> _Case:
