@@ -13,6 +13,7 @@ from dtprob.effects import (
     front_end,
     loss,
     motion,
+    network,
     noise,
     nonlinearity,
     orientation,
@@ -35,6 +36,7 @@ FAMILIES: Final[dict[str, Family]] = {
     **nonlinearity.FAMILIES,
     **motion.FAMILIES,
     **noise.FAMILIES,
+    **network.FAMILIES,
 }
 """For each family's name, the function (sites, data) -> its instances on such a model and data."""
 

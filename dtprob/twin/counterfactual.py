@@ -148,8 +148,9 @@ class LogLike(Protocol):
 def transitions(episode: LogLike) -> Transition:
     """The slots of one logged episode, each field (slot, device); nothing arrived before the first."""
     arrival, ack = (jnp.asarray(x, jnp.int32) for x in (episode.arrival, episode.ack))
-    before = [jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]]) for x in (arrival, ack)]
-    state = State(jnp.asarray(episode.buffer, jnp.int32), *before, jnp.arange(len(arrival), dtype=jnp.int32))
+    last_arrival, last_ack = (jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]]) for x in (arrival, ack))
+    slot = jnp.arange(len(arrival), dtype=jnp.int32)
+    state = State(jnp.asarray(episode.buffer, jnp.int32), last_arrival, last_ack, slot)
     return Transition(state, jnp.asarray(episode.action, jnp.int32), ack, arrival)
 
 

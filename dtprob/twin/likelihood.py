@@ -74,7 +74,7 @@ def _likelihoods(
 
     def one(value: Mapping[str, Array]) -> dict[str, Array]:
         fixed = handlers.substitute(handlers.seed(model, jax.random.key(0)), data=dict(value))
-        terms, _ = compute_log_probs(fixed, (), eqx.combine(arrays, static), {}, sum_log_prob=False)
+        terms, _ = compute_log_probs(fixed, (), dict(eqx.combine(arrays, static)), {}, sum_log_prob=False)
         return {name: _summed(terms[name], own, window, apart) for name, own in axes.items()}
 
     return jax.lax.map(one, latent, batch_size=_BATCH)

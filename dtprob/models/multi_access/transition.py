@@ -162,6 +162,11 @@ def invert(log_probability: Float[Array, " outcome"], uniform: Float[Array, ""])
 def lowest(
     rank: Float[Array, " device"], sender: Bool[Array, " device"], count: Int[Array, ""]
 ) -> Int[Array, " device"]:
-    """1 at the `count` senders of the lowest rank."""
-    place = jnp.argsort(jnp.argsort(jnp.where(sender, rank, 2.0)))
+    """1 at the `count` senders of the lowest rank, the earlier device first where two are equal.
+
+    Comparing all pairs is faster than sorting for as many devices as a network has.
+    """
+    device = jnp.arange(rank.shape[-1])
+    before = (rank < rank[:, None]) | ((rank == rank[:, None]) & (device < device[:, None]))
+    place = jnp.sum(before & sender, axis=-1)
     return (sender & (place < count)).astype(jnp.int32)

@@ -1,0 +1,219 @@
+"""Traffic that is not as the twin learned it: devices that fall silent, load, bursts, coupling, drift."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
+from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.network.laws import (
+    ClustersLike,
+    at,
+    clusters_of,
+    last_arrival,
+    mix,
+    progress,
+    same_arrival,
+    thinned,
+)
+
+_MOST_PAIRS: Final = 120
+"""Pairs of devices in which coupling is looked for; larger networks have none offered."""
+
+
+def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
+    """A device generates fewer packets, or none, and the others go on as before."""
+    clusters = _clusters(sites, data)
+    if clusters is None:
+        return []
+    effects: list[Effect] = []
+    for device in range(clusters.devices):
+        cluster = int(clusters.cluster_of[device])
+        bit = int(clusters.weight[cluster, device])
+
+        def thin(
+            value: Any, p: Mapping[str, Any], _: Mapping[str, Any], cluster: int = cluster, bit: int = bit
+        ) -> Any:
+            own = at(cluster, value.shape[2])[:, None]
+            return jnp.where(own, mix(value, thinned(value, bit), p["loss"]), value)
+
+        effects.append(
+            Effect(
+                "device_disconnected",
+                {"arrival_logits": thin},
+                (half_normal("loss", 3.0),),
+                instance=f"device_{device}",
+                physics=f"Each packet of device {device} is not generated with probability 1 - exp(-loss).",
+                source="Thinning of the joint arrivals: P(a) of outcomes with the device moves to those without.",
+                requires=("clusters",),
+            )
+        )
+    return effects
+
+
+def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
+    """A device, or all of them, generate packets at another rate."""
+    clusters = _clusters(sites, data)
+    if clusters is None:
+        return []
+    chosen = [(None, np.ones(clusters.devices, dtype=bool))]
+    chosen += [(f"device_{k}", at(k, clusters.devices)) for k in range(clusters.devices)]
+    effects: list[Effect] = []
+    for instance, devices in chosen:
+        count = _count(clusters, devices)
+
+        def tilt(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], count: Any = count) -> Any:
+            return value + p["log_odds"] * count
+
+        who = "all devices" if instance is None else instance.replace("_", " ")
+        effects.append(
+            Effect(
+                "arrival_rate_shift",
+                {"arrival_logits": tilt},
+                (normal("log_odds", 1.0),),
+                instance=instance,
+                physics=f"The odds of an arrival at {who} change by a factor.",
+                source="Exponential tilt of the joint arrivals: P(a) exp(c n(a)).",
+                requires=("clusters",),
+            )
+        )
+    return effects
+
+
+def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
+    """Arrivals come in bursts: more likely after an arrival, or in some windows than in others."""
+    clusters = _clusters(sites, data)
+    if clusters is None:
+        return []
+    effects: list[Effect] = []
+    for device in range(clusters.devices):
+        count = _count(clusters, at(device, clusters.devices))
+
+        def follow(
+            value: Any,
+            p: Mapping[str, Any],
+            context: Mapping[str, Any],
+            device: int = device,
+            count: Any = count,
+        ) -> Any:
+            last = last_arrival(context, clusters, device)
+            return value + p["log_odds"] * last[..., None, None] * count
+
+        effects.append(
+            Effect(
+                "bursty_traffic",
+                {"arrival_logits": follow},
+                (normal("log_odds", 1.0),),
+                instance=f"device_{device}",
+                physics=f"An arrival at device {device} changes the odds of one in the next slot.",
+                source="First-order Markov dependence: P(a) exp(c a_k (a_k[t-1] - 1/2)).",
+                requires=("clusters", "previous"),
+            )
+        )
+    total = _count(clusters, np.ones(clusters.devices, dtype=bool))
+    effects.append(
+        Effect(
+            "bursty_traffic",
+            {"arrival_logits": lambda value, p, _: value + p["scale"] * p[FIELD] * total},
+            (half_normal("scale", 1.0),),
+            instance="each_window",
+            kind="variance",
+            physics="The load differs at random between windows.",
+            source="P(a) exp(s z n(a)), z standard normal per window: over-dispersed counts.",
+            requires=("clusters",),
+            field_shape=lambda value, _: (value.shape[0], 1, 1, 1),
+        )
+    )
+    return effects
+
+
+def cross_cluster_traffic(sites: Sites, data: Data) -> list[Effect]:
+    """Arrivals of devices in different clusters depend on one another."""
+    clusters = _clusters(sites, data)
+    if clusters is None or data.get("arrivals") is None:
+        return []
+    of, devices = clusters.cluster_of, range(clusters.devices)
+    ordered = [(i, j) for i in devices for j in devices if of[i] != of[j]]
+    if len(ordered) > _MOST_PAIRS:
+        return []
+    effects: list[Effect] = []
+    for i, j in ordered:
+        effects.append(_coupled(clusters, i, j, same=False))
+        if of[i] < of[j]:
+            effects.append(_coupled(clusters, i, j, same=True))
+    return effects
+
+
+def _coupled(clusters: ClustersLike, i: int, j: int, *, same: bool) -> Effect:
+    """Device i's arrival, in this slot or the one before, changes the odds of device j's."""
+    count = _count(clusters, at(j, clusters.devices))
+    cause = same_arrival if same else last_arrival
+
+    def couple(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        return value + p["log_odds"] * cause(context, clusters, i)[..., None, None] * count
+
+    when, at_slot = ("the same slot", "t") if same else ("the slot before", "t-1")
+    return Effect(
+        "cross_cluster_traffic",
+        {"arrival_logits": couple},
+        (normal("log_odds", 1.0),),
+        instance=f"{i}_with_{j}" if same else f"{i}_to_{j}",
+        physics=f"An arrival at device {i} in {when} changes the odds of one at device {j}.",
+        source=f"Log-linear interaction: P(a) exp(c a_j (a_i[{at_slot}] - 1/2)).",
+        requires=("clusters", "arrivals" if same else "previous"),
+    )
+
+
+def drift(sites: Sites, data: Data) -> list[Effect]:
+    """The load of a device, or how well the channel delivers, changes over the log."""
+    clusters = _clusters(sites, data)
+    if clusters is None or sites["arrival_logits"].shape[0] < 2:
+        return []
+    effects: list[Effect] = []
+    for device in range(clusters.devices):
+        count = _count(clusters, at(device, clusters.devices))
+
+        def slope(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], count: Any = count) -> Any:
+            return value + p["log_odds"] * progress(value.shape[0])[..., None, None] * count
+
+        effects.append(_drift({"arrival_logits": slope}, f"device_{device}", f"arrivals at device {device}"))
+    if offers(sites, "reception_logits"):
+
+        def fade(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+            return value + p["log_odds"] * progress(value.shape[0])[..., None] * np.arange(value.shape[2])
+
+        effects.append(_drift({"reception_logits": fade}, "reception", "each delivery"))
+    return effects
+
+
+def _drift(rewrites: Mapping[str, Any], instance: str, what: str) -> Effect:
+    return Effect(
+        "drift",
+        rewrites,
+        (normal("log_odds", 0.5),),
+        instance=instance,
+        physics=f"The log-odds of {what} change linearly, by twice this over the whole log.",
+        source="P exp(c x), x from -1 in the first window to 1 in the last.",
+    )
+
+
+def _clusters(sites: Sites, data: Data) -> ClustersLike | None:
+    return clusters_of(data) if offers(sites, "arrival_logits") else None
+
+
+def _count(clusters: ClustersLike, devices: Any) -> Any:
+    """How many of some devices have an arrival, (cluster, outcome)."""
+    return (clusters.arrives * np.asarray(devices)[:, None]).sum(axis=1).astype(float)
+
+
+FAMILIES: Final[dict[str, Family]] = {
+    "device_disconnected": device_disconnected,
+    "arrival_rate_shift": arrival_rate_shift,
+    "bursty_traffic": bursty_traffic,
+    "cross_cluster_traffic": cross_cluster_traffic,
+    "drift": drift,
+}

@@ -1,0 +1,261 @@
+"""A shared channel that is not as the twin learned it: capture, near and far devices, interference, losses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
+from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.network.laws import at, mix
+
+type Other = Callable[[Any, Mapping[str, Any]], Float[Array, "episode slot delivery_count"]]
+
+
+def reception_shift(sites: Sites, _data: Data) -> list[Effect]:
+    """With a given number of senders more or fewer packets are delivered."""
+    if not offers(sites, "reception_logits"):
+        return []
+    effects: list[Effect] = []
+    for count in range(1, sites["reception_logits"].shape[-1]):
+
+        def tilt(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], count: int = count) -> Any:
+            own = _senders(context) == count
+            return value + p["log_odds"] * own[..., None] * np.arange(value.shape[-1])
+
+        effects.append(
+            Effect(
+                "reception_shift",
+                {"reception_logits": tilt},
+                (normal("log_odds", 1.0),),
+                instance=f"{count}_senders",
+                physics=f"The odds of each further delivery change when {count} devices send.",
+                source="Exponential tilt: P(d) exp(c d).",
+                requires=("sending",),
+            )
+        )
+    return effects
+
+
+def capture(sites: Sites, _data: Data) -> list[Effect]:
+    """The strongest of colliding packets is received after all."""
+    if not offers(sites, "reception_logits"):
+        return []
+
+    def other(value: Any, context: Mapping[str, Any]) -> Any:
+        p = jax.nn.softmax(value)
+        captured = jnp.concatenate(
+            [jnp.zeros_like(p[..., :1]), (p[..., :1] + p[..., 1:2]), p[..., 2:]], axis=-1
+        )
+        return jnp.where((_senders(context) >= 2)[..., None], captured, p)
+
+    return [
+        Effect(
+            "capture",
+            {"reception_logits": _mixed(other, "capture")},
+            (half_normal("capture", 1.0),),
+            physics="With probability 1 - exp(-capture) one packet of a collision without delivery is received.",
+            source="Capture effect: Zorzi and Rao, IEEE J. Sel. Areas Commun. 12 (1994).",
+            requires=("sending",),
+        )
+    ]
+
+
+def near_far(sites: Sites, _data: Data) -> list[Effect]:
+    """A device is heard rather than the others that send with it, or is not."""
+    if not offers(sites, "device_advantage"):
+        return []
+    devices = sites["device_advantage"].shape[-1]
+    return [
+        Effect(
+            "near_far",
+            {
+                "device_advantage": lambda value, p, _, device=device: (
+                    value + p["advantage"] * at(device, devices)
+                )
+            },
+            (normal("advantage", 1.0),),
+            instance=f"device_{device}",
+            physics=f"Log-odds that device {device} is delivered rather than another sender.",
+            source="Conditional Bernoulli law of the delivered set: Chen and Liu, Statistica Sinica 7 (1997).",
+        )
+        for device in range(devices)
+    ]
+
+
+def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
+    """The channel has good and bad times: a slot is like the one before, or windows differ."""
+    if not offers(sites, "reception_logits"):
+        return []
+
+    def follow(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        return value + p["log_odds"] * _heard_before(context)[..., None] * np.arange(value.shape[-1])
+
+    effects = [
+        Effect(
+            "bursty_channel",
+            {"reception_logits": follow},
+            (normal("log_odds", 1.0),),
+            physics="The odds of a delivery depend on whether the senders of the slot before were heard.",
+            source="First-order surrogate of the Gilbert-Elliott channel: P(d) exp(c d (heard[t-1] - 1/2)).",
+            requires=("sending", "deliveries"),
+        )
+    ]
+    effects.append(
+        Effect(
+            "bursty_channel",
+            {
+                "reception_logits": lambda value, p, _: (
+                    value + p["scale"] * p[FIELD] * np.arange(value.shape[-1])
+                )
+            },
+            (half_normal("scale", 1.0),),
+            instance="each_window",
+            kind="variance",
+            physics="The channel differs at random between windows.",
+            source="P(d) exp(s z d), z standard normal per window.",
+            field_shape=lambda value, _: (value.shape[0], 1, 1),
+        )
+    )
+    return effects
+
+
+def interferer(sites: Sites, _data: Data) -> list[Effect]:
+    """A transmitter that the log does not know sends too, always or near one device."""
+    if not offers(sites, "reception_logits", "device_advantage"):
+        return []
+    devices = sites["device_advantage"].shape[-1]
+    effects: list[Effect] = []
+    for device in (None, *range(devices)):
+
+        def other(value: Any, context: Mapping[str, Any], device: int | None = device) -> Any:
+            table = jnp.exp(context["log_reception"])
+            more = jnp.concatenate([table[1:], jnp.eye(1, table.shape[1])])
+            share = np.arange(table.shape[1]) / np.arange(1, len(table) + 1)[:, None]
+            law = (more * jnp.maximum(1.0 - share, 0.0) + _next(more * share))[_senders(context)]
+            return jnp.where(_with(context, device), law, jax.nn.softmax(value))
+
+        effects.append(
+            Effect(
+                "interferer",
+                {"reception_logits": _mixed(other, "activity")},
+                (half_normal("activity", 0.5),),
+                instance=None if device is None else f"device_{device}",
+                physics="In a share 1 - exp(-activity) of the slots"
+                + ("" if device is None else f" in which device {device} sends")
+                + " one sender more takes part.",
+                source="P_s becomes P_{s+1}; one of its d deliveries is the stranger's with probability d / (s + 1).",
+                requires=("sending", "log_reception"),
+            )
+        )
+    return effects
+
+
+def ack_loss(sites: Sites, _data: Data) -> list[Effect]:
+    """Deliveries of a device are not acknowledged."""
+    if not offers(sites, "reception_logits", "device_advantage"):
+        return []
+    devices = sites["device_advantage"].shape[-1]
+    effects: list[Effect] = []
+    for device in range(devices):
+
+        def other(value: Any, context: Mapping[str, Any], device: int = device) -> Any:
+            p, senders = jax.nn.softmax(value), jnp.maximum(_senders(context), 1)
+            share = np.arange(p.shape[-1]) / senders[..., None]
+            law = p * jnp.maximum(1.0 - share, 0.0) + _next(p * share)
+            return jnp.where(_with(context, device), law, p)
+
+        effects.append(
+            Effect(
+                "ack_loss",
+                {
+                    "reception_logits": _mixed(other, "loss"),
+                    "device_advantage": lambda value, p, _, device=device: (
+                        value - p["loss"] * at(device, devices)
+                    ),
+                },
+                (half_normal("loss", 0.5),),
+                instance=f"device_{device}",
+                physics=f"A delivery of device {device} goes unacknowledged with probability 1 - exp(-loss).",
+                source="Thinning of the deliveries; exact for one delivery per slot.",
+                requires=("sending",),
+            )
+        )
+    return effects
+
+
+def duty_cycle(sites: Sites, _data: Data) -> list[Effect]:
+    """A device's radio sleeps in part of the slots in which it is to send."""
+    if not offers(sites, "reception_logits", "device_advantage"):
+        return []
+    devices = sites["device_advantage"].shape[-1]
+    effects: list[Effect] = []
+    for device in range(devices):
+
+        def other(value: Any, context: Mapping[str, Any], device: int = device) -> Any:
+            law = jnp.exp(context["log_reception"])[jnp.maximum(_senders(context) - 1, 0)]
+            return jnp.where(_with(context, device), law, jax.nn.softmax(value))
+
+        effects.append(
+            Effect(
+                "duty_cycle",
+                {
+                    "reception_logits": _mixed(other, "sleep"),
+                    "device_advantage": lambda value, p, _, device=device: (
+                        value - p["sleep"] * at(device, devices)
+                    ),
+                },
+                (half_normal("sleep", 0.5),),
+                instance=f"device_{device}",
+                physics=f"Device {device} does not transmit in a share 1 - exp(-sleep) of the slots in which it is to.",
+                source="P_s becomes P_{s-1}; who is delivered to first order in the share.",
+                requires=("sending", "log_reception"),
+            )
+        )
+    return effects
+
+
+def _mixed(other: Other, parameter: str) -> Callable[[Any, Mapping[str, Any], Mapping[str, Any]], Any]:
+    def rewrite(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        return mix(value, other(value, context), p[parameter])
+
+    return rewrite
+
+
+def _senders(context: Mapping[str, Any]) -> Array:
+    """How many devices send, (episode, slot)."""
+    return jnp.sum(jnp.asarray(context["sending"]), axis=-1)
+
+
+def _with(context: Mapping[str, Any], device: int | None) -> Array:
+    """Whether the device sends, (episode, slot, 1); whether any does without one."""
+    sending = jnp.asarray(context["sending"], bool)
+    return (jnp.any(sending, axis=-1) if device is None else sending[..., device])[..., None]
+
+
+def _next(mass: Float[Array, "*batch delivery_count"]) -> Float[Array, "*batch delivery_count"]:
+    """Mass moved to one delivery fewer; that of none is gone."""
+    return jnp.concatenate([mass[..., 1:], jnp.zeros_like(mass[..., :1])], axis=-1)
+
+
+def _heard_before(context: Mapping[str, Any]) -> Float[Array, "episode slot"]:
+    """Share of the senders of the slot before that were delivered, less 1/2; 0 where none sent or none is known."""
+    senders = _senders(context)
+    heard = jnp.where(senders > 0, jnp.asarray(context["deliveries"]) / jnp.maximum(senders, 1) - 0.5, 0.0)
+    return jnp.concatenate([jnp.zeros_like(heard[:, :1]), heard[:, :-1]], axis=1)
+
+
+FAMILIES: Final[dict[str, Family]] = {
+    "reception_shift": reception_shift,
+    "capture": capture,
+    "near_far": near_far,
+    "bursty_channel": bursty_channel,
+    "interferer": interferer,
+    "ack_loss": ack_loss,
+    "duty_cycle": duty_cycle,
+}

@@ -1,0 +1,117 @@
+"""Effects on a network's traffic and channel: their contract, and what they do to laws that are known."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dtprob.effects import catalogue
+from dtprob.effects.effect import Rewriting
+from dtprob.effects.network import FAMILIES
+from dtprob.models.declaration import declare, trace_model
+from dtprob.models.multi_access import multi_access, records
+from dtprob.testing import check_effect
+from tests.small_network import ARRIVAL, CLUSTERS, simulate
+
+TABLES = {
+    "log_arrival": jnp.log(jnp.array([[[0.2, 0.4, 0.3, 0.1]]] * 2)),
+    "log_reception": jnp.log(
+        jnp.array(
+            [
+                [1, 0, 0, 0, 0],
+                [0.1, 0.9, 0, 0, 0],
+                [0.2, 0.5, 0.3, 0, 0],
+                [0.6, 0.2, 0.1, 0.1, 0],
+                [0.8, 0.1, 0.1, 0, 0],
+            ]
+        )
+        + 1e-9
+    ),
+}
+SHOWN = [
+    "device_disconnected[device_1]", "arrival_rate_shift", "bursty_traffic[device_2]", "bursty_traffic[each_window]",
+    "cross_cluster_traffic[0_with_2]", "cross_cluster_traffic[3_to_1]", "drift[device_0]", "drift[reception]",
+    "reception_shift[2_senders]", "capture", "near_far[device_0]", "bursty_channel", "bursty_channel[each_window]",
+    "interferer", "interferer[device_2]", "ack_loss[device_3]", "duty_cycle[device_1]",
+]  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def data():
+    return {**records(simulate(40, 0), clusters=CLUSTERS, window=10), "concentration": 1.0}
+
+
+@pytest.fixture(scope="module")
+def offered(data):
+    return {effect.name: effect for effect in catalogue(declare(multi_access, data).sites, data)}
+
+
+def test_every_family_has_instances_and_nothing_else_is_offered(offered):
+    assert {effect.family for effect in offered.values()} == set(FAMILIES)
+    assert {name.partition("[")[0] for name in SHOWN} == set(FAMILIES)
+
+
+@pytest.mark.parametrize("name", SHOWN)
+def test_effects_keep_their_contract(offered, data, name):
+    check_effect(offered[name], multi_access, data)
+
+
+def law(data, effect=None, site="arrival_logits", **parameters):
+    """Probabilities at a site under the tables, with an effect of given parameters."""
+
+    def extended(**arguments):
+        chosen = () if effect is None else (effect,)
+        with Rewriting(None, chosen, {e.name: parameters for e in chosen}, arguments):
+            multi_access(**arguments)
+
+    value = trace_model(extended, data, jax.random.key(0), TABLES)[site]["value"]
+    return np.asarray(jax.nn.softmax(value))
+
+
+def test_a_disconnected_device_generates_nothing_and_its_neighbour_as_before(offered, data):
+    after = law(data, offered["device_disconnected[device_1]"], loss=jnp.array(50.0))
+    np.testing.assert_allclose(after[0, 0, 0], [0.6, 0.0, 0.4, 0.0], atol=1e-9)
+    np.testing.assert_allclose(after[0, 0, 1], [0.2, 0.4, 0.3, 0.1], atol=1e-9)
+    half = law(data, offered["device_disconnected[device_0]"], loss=jnp.log(2.0))
+    np.testing.assert_allclose(half[0, 0, 0], [0.35, 0.45, 0.15, 0.05], atol=1e-9)
+
+
+def test_the_disconnection_of_the_report(offered, data):
+    assert np.array_equal(ARRIVAL, [0.2, 0.4, 0.4, 0.0])
+    tables = {**TABLES, "log_arrival": jnp.log(jnp.broadcast_to(ARRIVAL, (2, 1, 4)) + 1e-12)}
+    effect = offered["device_disconnected[device_1]"]
+    value = trace_model(multi_access, data, jax.random.key(0), tables)["arrival_logits"]["value"]
+    after = jax.nn.softmax(effect.rewrites["arrival_logits"](value, {"loss": jnp.array(50.0)}, data))
+    np.testing.assert_allclose(after[0, 0, 0], [0.6, 0.0, 0.4, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("name", "amount"), [("interferer", 1.0), ("ack_loss[device_1]", 0.5), ("capture", 2.0)]
+)
+def test_mixtures_of_receptions_stay_laws(offered, data, name, amount):
+    effect = offered[name]
+    parameter = effect.parameters[0].name
+    before, after = law(data, site="reception_logits"), None
+    logits = trace_model(multi_access, data, jax.random.key(0), TABLES)
+    value = logits["reception_logits"]["value"]
+    context = {**data, "log_reception": TABLES["log_reception"]}
+    changed = effect.rewrites["reception_logits"](value, {parameter: jnp.array(amount)}, context)
+    mass = np.asarray(jnp.exp(changed - jax.nn.logsumexp(value, axis=-1, keepdims=True)).sum(axis=-1))
+    np.testing.assert_allclose(mass, 1.0, atol=1e-6)
+    after = np.asarray(jax.nn.softmax(changed))
+    senders = np.asarray(data["sending"]).sum(axis=-1)
+    mean = (np.arange(5) * (after - before)).sum(axis=-1)
+    sign = 1 if name == "capture" else -1
+    assert np.all(sign * mean[senders >= 2] >= -1e-6)
+    assert np.abs(mean[senders >= 1]).max() > 0.01
+
+
+def test_a_stranger_takes_its_share_of_the_deliveries(offered, data):
+    senders = np.asarray(data["sending"]).sum(axis=-1)
+    value = trace_model(multi_access, data, jax.random.key(0), TABLES)["reception_logits"]["value"]
+    context = {**data, "log_reception": TABLES["log_reception"]}
+    changed = offered["interferer"].rewrites["reception_logits"](
+        value, {"activity": jnp.array(60.0)}, context
+    )
+    alone = np.asarray(jax.nn.softmax(changed))[senders == 1]
+    np.testing.assert_allclose(alone[0], [0.2 + 0.25, 0.25 + 0.3, 0, 0, 0], atol=1e-6)
