@@ -96,9 +96,7 @@ def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, 
     return material_permittivity[index], material_conductivity[index]
 
 
-def traced_gain(
-    paths: PathSet, materials: Materials, law: Law
-) -> Complex[Array, "link path"]:
+def traced_gain(paths: PathSet, materials: Materials, law: Law) -> Complex[Array, "link path"]:
     """The site `path_gain` and, before it, those of what the objects are made of.
 
     Args:
