@@ -11,6 +11,7 @@ import jax
 
 from dtprob.inference.chains import ChainMethod
 from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions
+from dtprob.inference.enough import Enough
 from dtprob.inference.kernel import Kernel
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.run import Schedule, run_chains
@@ -34,6 +35,9 @@ class AbstractNoUTurn(AbstractEngine):
         chain_method: "sequential" or "vectorized": chains one after the other, or side by side, which is
             faster on a GPU but makes the last bits of a draw depend on the number of chains.
         initial: constrained values that every chain starts from; sites without one start from the prior.
+        enough_ess: stop once every coordinate has this effective sample size and no r-hat above `enough_rhat`;
+            0 makes all draws.
+        enough_rhat: see `enough_ess`.
     """
 
     answer: ClassVar[Answer] = "exact"
@@ -46,6 +50,8 @@ class AbstractNoUTurn(AbstractEngine):
     dense_mass: bool = False
     chain_method: ChainMethod = "sequential"
     initial: Mapping[str, Any] | None = None
+    enough_ess: int = 0
+    enough_rhat: float = 1.01
 
     @abc.abstractmethod
     def kernel(self, warmup: int) -> Kernel:
@@ -55,5 +61,6 @@ class AbstractNoUTurn(AbstractEngine):
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        schedule = Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial)
+        enough = Enough(self.enough_ess, self.enough_rhat)
+        schedule = Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial, enough)
         return run_chains(self, self.kernel, schedule, key, model=model, data=data, options=options)

@@ -23,6 +23,7 @@ from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
 from dtprob.inference.chains import START, Chain, ChainMethod, Walk, advance, recentre, start
 from dtprob.inference.engine import AbstractEngine, RunOptions, check_counts, check_key
+from dtprob.inference.enough import LOOK_EVERY, NEVER, Enough
 from dtprob.inference.identity import identity
 from dtprob.inference.kernel import Kernel
 from dtprob.inference.modes import starting_points
@@ -45,6 +46,7 @@ class Schedule:
         draws: steps of each chain that are.
         method: chains one after the other ("sequential") or side by side ("vectorized").
         initial: constrained values that the chains start from.
+        enough: when to stop before all draws are made.
     """
 
     chains: int
@@ -52,6 +54,7 @@ class Schedule:
     draws: int
     method: ChainMethod
     initial: Mapping[str, Any] | None = None
+    enough: Enough = NEVER
 
     @property
     def total(self) -> int:
@@ -112,7 +115,7 @@ class _Loop:
         done, chains, kept = self._begin(keys, wanted)
         total = self.schedule.total
         with Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress:
-            while done < total:
+            while done < total and not self._is_enough(done, kept):
                 if done == self.walk.explore > 0:
                     chains = self._compiled(recentre)(chains, keys, self.inputs)
                 end = self._chunk_end(done)
@@ -144,9 +147,18 @@ class _Loop:
         return chains, blocks
 
     def _chunk_end(self, done: int) -> int:
-        """The end of the chunk that begins after `done` steps: no chunk crosses a phase."""
-        ends = (self.walk.explore, self.walk.warmup, self.schedule.total)
+        """The end of the chunk that begins after `done` steps: no chunk crosses a phase, or a look at the draws."""
+        ends = [self.walk.explore, self.walk.warmup, self.schedule.total]
+        if self.schedule.enough.ess:
+            looks = max(done - self.walk.warmup, 0) // LOOK_EVERY + 1
+            ends.append(self.walk.warmup + looks * LOOK_EVERY)
         return min(done + self.options.chunk, *(end for end in ends if end > done))
+
+    def _is_enough(self, done: int, kept: list[dict[str, np.ndarray]]) -> bool:
+        enough = self.schedule.enough
+        if not enough.is_look(done - self.walk.warmup):
+            return False
+        return enough.reached(self.target, _joined(kept)["position"])
 
     def _begin(
         self, keys: PRNGKeyArray, wanted: Mapping[str, Any]

@@ -211,6 +211,23 @@ def test_progress_is_plain_lines_and_a_status_file(tmp_path, capfd):
     assert (status["done"], status["total"], status["phase"]) == (110, 110, "draws")
 
 
+def test_stops_early_once_there_is_enough(tmp_path):
+    """At a look, which chunks and interruptions do not move; every draw is that of the whole run."""
+    data = normal_data()
+    whole = NUTS(warmup=100, draws=1000, chains=2)(KEY, normal, data)
+    engine = NUTS(warmup=100, draws=1000, chains=2, enough_ess=150, enough_rhat=1.1)
+    stopped = engine(KEY, normal, data, options=RunOptions(chunk=70))
+    count = stopped.draws_per_chain
+    assert count in (200, 400)
+    np.testing.assert_array_equal(stopped.draws["level"], whole.draws["level"][:, :count])
+    assert summary(stopped).loc["level", "ess"] > 150
+    options = RunOptions(chunk=1000, checkpoint=tmp_path / "run.h5", resume=True)
+    for _ in range(2):
+        assert same(stopped, engine(KEY, normal, data, options=options))
+    never = NUTS(warmup=100, draws=300, chains=2, enough_ess=10_000)(KEY, normal, data)
+    assert never.draws_per_chain == 300
+
+
 def test_silent_by_default(capfd):
     NUTS(**SHORT)(KEY, normal, normal_data())
     assert capfd.readouterr() == ("", "")
