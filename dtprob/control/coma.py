@@ -39,6 +39,7 @@ class COMA:
         entropy: weight of the entropy at the start; it falls to zero over two thirds of the training.
         scale: reward that counts as one.
         frame: slots of the frame whose phase the critic sees.
+        capacity: packets that a buffer holds.
     """
 
     actor_rate: float = 5e-3
@@ -50,10 +51,11 @@ class COMA:
     entropy: float = 0.05
     scale: float = 100.0
     frame: int = 4
+    capacity: int = 1
 
     def start(self, key: PRNGKeyArray, policy: Any) -> Kept:
         """See `Learner`."""
-        critic = CentralCritic(key, policy.initial().shape[0], self.frame)
+        critic = CentralCritic(key, policy.initial().shape[0], self.frame, self.capacity)
         actor_state, critic_state = (
             self._optimiser().init(eqx.filter(module, eqx.is_array)) for module in (policy, critic)
         )

@@ -36,6 +36,7 @@ class IPPO:
         entropy: weight of the entropy at the start; it falls to zero over two thirds of the training.
         scale: reward that counts as one.
         frame: slots of the frame whose phase the critic sees.
+        capacity: packets that a buffer holds.
     """
 
     rate: float = 5e-3
@@ -46,10 +47,11 @@ class IPPO:
     entropy: float = 0.02
     scale: float = 100.0
     frame: int = 4
+    capacity: int = 1
 
     def start(self, key: PRNGKeyArray, policy: Any) -> Kept:
         """See `Learner`."""
-        critic = LocalCritic(key, policy.initial().shape[0], self.frame)
+        critic = LocalCritic(key, policy.initial().shape[0], self.frame, self.capacity)
         return Kept(critic, self._optimiser().init(eqx.filter((policy, critic), eqx.is_array)))
 
     def update(

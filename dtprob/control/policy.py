@@ -32,28 +32,38 @@ class FramePolicy(eqx.Module):
         networks: of all devices, 3-32-32-frame with tanh; leaves (device, ...).
         devices: how many.
         frame: slots of a frame.
+        capacity: packets that a buffer holds.
     """
 
     networks: eqx.nn.MLP
     devices: int = eqx.field(static=True)
     frame: int = eqx.field(static=True)
+    capacity: int = eqx.field(static=True)
 
-    def __init__(self, key: PRNGKeyArray, devices: int, frame: int = 4, width: int = 32) -> None:
+    def __init__(
+        self, key: PRNGKeyArray, devices: int, frame: int = 4, capacity: int = 1, *, width: int = 32
+    ) -> None:
         def one(key: PRNGKeyArray) -> eqx.nn.MLP:
             return eqx.nn.MLP(3, frame, width, 2, jnp.tanh, key=key)
 
         self.networks = eqx.filter_vmap(one)(jax.random.split(key, devices))
-        self.devices, self.frame = devices, frame
+        self.devices, self.frame, self.capacity = devices, frame, capacity
 
     def initial(self) -> Memory:
         """Nothing."""
         return jnp.zeros((self.devices, 0))
 
+    def table(self) -> Float[Array, "device buffer arrival ack phase"]:
+        """The log-odds of sending for everything a device can see."""
+        ranges = (self.capacity + 1, 2, 2)
+        grid = jnp.stack(jnp.meshgrid(*(jnp.linspace(-1.0, 1.0, n) for n in ranges), indexing="ij"), axis=-1)
+        of_all = jax.vmap(jax.vmap(jax.vmap(lambda network, x: network(x), (None, 0)), (None, 0)), (None, 0))
+        return eqx.filter_vmap(of_all, in_axes=(eqx.if_array(0), None))(self.networks, grid)
+
     def __call__(self, memory: Memory, observation: Observation) -> tuple[Memory, Float[Array, " device"]]:
         """See `Policy`."""
-        seen = _local(observation)[:, :3]
-        every = eqx.filter_vmap(lambda network, x: network(x))(self.networks, seen)
-        return memory, every[:, observation.slot % self.frame]
+        seen = observation.buffer, observation.arrival, observation.ack
+        return memory, self.table()[jnp.arange(self.devices), *seen, observation.slot % self.frame]
 
 
 @final
@@ -141,22 +151,9 @@ def aloha(devices: int, capacity: int, probability: float) -> TablePolicy:
     return TablePolicy(jnp.full((1, devices, capacity + 1, 2, 2), probability))
 
 
-def tabulate(policy: FramePolicy, capacity: int) -> TablePolicy:
-    """The table of a memoryless policy; it sends with the same chances.
-
-    Args:
-        policy: as trained.
-        capacity: packets that a buffer holds.
-    """
-    grid = jnp.stack(jnp.meshgrid(*map(jnp.arange, (policy.frame, capacity + 1, 2, 2)), indexing="ij"), -1)
-
-    def chance(place: Int[Array, " 4"]) -> Float[Array, " device"]:
-        slot, *seen = place
-        each = [jnp.full(policy.devices, value) for value in (*seen, 0)]
-        return jax.nn.sigmoid(policy(policy.initial(), Observation(*each, slot=slot))[1])
-
-    table = jax.vmap(chance)(grid.reshape(-1, 4)).reshape(*grid.shape[:-1], policy.devices)
-    return TablePolicy(jnp.moveaxis(table, -1, 1))
+def tabulate(policy: FramePolicy) -> TablePolicy:
+    """The table of a memoryless policy; it sends with the same chances."""
+    return TablePolicy(jax.nn.sigmoid(jnp.moveaxis(policy.table(), -1, 0)))
 
 
 def unroll(

@@ -154,9 +154,7 @@ def test_two_devices_learn_to_share(learner):
     """From one half of the optimum's lead over random access, on the way to the optimum, at a fixed key."""
     budget = Budget(40_000, 32, 16)
     fit = jax.jit(
-        lambda key: (
-            tabulate(train(key, learner, FramePolicy(key, 2), world(PAIR), budget).policy, 1).probability
-        )
+        lambda key: tabulate(train(key, learner, FramePolicy(key, 2), world(PAIR), budget).policy).probability
     )
     exact = chain(PAIR)
     got = average(exact, np.asarray(fit(KEY), float)).throughput
