@@ -11,6 +11,7 @@ from dtprob.effects import (
     displacement,
     extra,
     front_end,
+    labels,
     loss,
     motion,
     network,
@@ -37,6 +38,7 @@ FAMILIES: Final[dict[str, Family]] = {
     **motion.FAMILIES,
     **noise.FAMILIES,
     **network.FAMILIES,
+    **labels.FAMILIES,
 }
 """For each family's name, the function (sites, data) -> its instances on such a model and data."""
 

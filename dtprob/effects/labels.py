@@ -1,0 +1,183 @@
+"""Where and how a predictor errs: by regions of its features, by a factor, by an old map, by noisier labels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
+from dtprob.effects.effect import FIELD, Effect
+
+_FEATURES: Final = 16
+"""Features, the first ones, whose regions are looked at."""
+_CELLS: Final = 6
+"""Cells of an old map along each of the two first features."""
+
+type Weight = Callable[[Any], Float[Array, " sample"]]
+
+
+def regional_bias(sites: Sites, data: Data) -> list[Effect]:
+    """The predictor is off by a constant everywhere, in a region of a feature, or ever more along a feature."""
+    if not offers(sites, "predicted_label"):
+        return []
+    unit = _unit(data)
+    everywhere: tuple[str, str, Weight] = ("everywhere", "everywhere", lambda x: jnp.ones(x.shape[0]))
+    return [
+        Effect(
+            "regional_bias",
+            {"predicted_label": _added(weight)},
+            (normal("bias", unit),),
+            instance=name,
+            physics=f"Labels are higher than predicted {text}, by a constant.",
+            source="y + b w(x), w of largest value 1.",
+            requires=("x",),
+        )
+        for name, text, weight in [everywhere, *_regions(data), *_slopes(data)]
+    ]
+
+
+def scale_bias(sites: Sites, _data: Data) -> list[Effect]:
+    """The predictor exaggerates or shrinks what it predicts."""
+    if not offers(sites, "predicted_label"):
+        return []
+
+    def stretch(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+        return value + (value - jnp.mean(value)) * jnp.expm1(p["log_scale"])
+
+    return [
+        Effect(
+            "scale_bias",
+            {"predicted_label": stretch},
+            (normal("log_scale", 0.3),),
+            physics="Labels differ from their mean by a common factor more than predicted.",
+            source="m + (y - m) exp(a), m the mean prediction.",
+        )
+    ]
+
+
+def label_noise(sites: Sites, data: Data) -> list[Effect]:
+    """Labels are noisier in a region of a feature than elsewhere."""
+    if not offers(sites, "label_deviation"):
+        return []
+
+    def louder(weight: Weight) -> Any:
+        def widen(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+            return value * jnp.exp(p["log_ratio"] * weight(context["x"]))
+
+        return widen
+
+    return [
+        Effect(
+            "label_noise",
+            {"label_deviation": louder(weight)},
+            (normal("log_ratio", 0.7),),
+            instance=name,
+            physics=f"The error's standard deviation is another {text}.",
+            source="s exp(c w(x)).",
+            requires=("x",),
+        )
+        for name, text, weight in _regions(data)
+    ]
+
+
+def stale_map(sites: Sites, data: Data) -> list[Effect]:
+    """The map behind the predictor is old: each cell of it is off by a random constant of its own."""
+    if not offers(sites, "predicted_label"):
+        return []
+    edges = [_quantiles(column, _CELLS) for column in np.asarray(data["x"], float).T[:2]]
+
+    def shift(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        x, cell = jnp.asarray(context["x"]), jnp.zeros(value.shape[0], int)
+        for feature, edge in enumerate(edges):
+            cell = cell * _CELLS + jnp.searchsorted(jnp.asarray(edge), x[:, feature])
+        return value + p["scale"] * p[FIELD].reshape(-1)[cell]
+
+    return [
+        Effect(
+            "stale_map",
+            {"predicted_label": shift},
+            (half_normal("scale", _unit(data)),),
+            kind="variance",
+            physics=f"A random offset in each of {_CELLS} cells along the first feature"
+            + (f" times {_CELLS} along the second." if len(edges) > 1 else "."),
+            source="y + s z_cell, z standard normal; cells hold equally many samples.",
+            requires=("x",),
+            field_shape=lambda *_: (1, _CELLS ** len(edges)),
+        )
+    ]
+
+
+def _unit(data: Data) -> float:
+    """Standard deviation of the predictions: what a large bias is measured by."""
+    return max(float(np.std(np.asarray(data["prediction"], float))), 1e-12)
+
+
+def _added(weight: Weight) -> Any:
+    def add(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        return value + p["bias"] * weight(context["x"])
+
+    return add
+
+
+def _columns(data: Data) -> Iterator[tuple[int, np.ndarray]]:
+    """The features that vary, by number."""
+    for index, column in enumerate(np.asarray(data["x"], float).T[:_FEATURES]):
+        if np.ptp(column) > 0:
+            yield index, column
+
+
+def _quantiles(column: np.ndarray, parts: int) -> np.ndarray:
+    return np.quantile(column, np.arange(1, parts) / parts)
+
+
+def _regions(data: Data) -> list[tuple[str, str, Weight]]:
+    """The lowest, middle and highest third of each feature; of one with two values each of them."""
+    regions: list[tuple[str, str, Weight]] = []
+    for index, column in _columns(data):
+        low, high = (float(edge) for edge in _quantiles(column, 3))
+        places: dict[str, tuple[float, float]] = {
+            "low": (-np.inf, low),
+            "middle": (low, high),
+            "high": (high, np.inf),
+        }
+        for name, (first, last) in places.items():
+            inside = (column > first) & (column <= last)
+            if not inside.any() or inside.all():
+                continue
+
+            def within(
+                x: Any, index: int = index, first: float = first, last: float = last
+            ) -> Float[Array, " sample"]:
+                return ((x[:, index] > first) & (x[:, index] <= last)).astype(float)
+
+            text = (
+                f"where feature {index} is {name} ({column[inside].min():.3g} to {column[inside].max():.3g})"
+            )
+            regions.append((f"x{index}_{name}", text, within))
+    return regions
+
+
+def _slopes(data: Data) -> list[tuple[str, str, Weight]]:
+    """Each feature itself, from -1 at its smallest to 1 at its largest value."""
+    slopes: list[tuple[str, str, Weight]] = []
+    for index, column in _columns(data):
+        middle, half = float(column.max() + column.min()) / 2, float(np.ptp(column)) / 2
+
+        def along(x: Any, index: int = index, middle: float = middle, half: float = half) -> jax.Array:
+            return (x[:, index] - middle) / half
+
+        slopes.append((f"x{index}_slope", f"in proportion to feature {index}", along))
+    return slopes
+
+
+FAMILIES: Final[dict[str, Family]] = {
+    "regional_bias": regional_bias,
+    "scale_bias": scale_bias,
+    "label_noise": label_noise,
+    "stale_map": stale_map,
+}

@@ -1,0 +1,89 @@
+"""The predictor as a twin: its posterior in closed form, and the way in which it errs is named."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from dtprob.data import Labels
+from dtprob.effects import catalogue
+from dtprob.errors import InputError
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.settings import Settings
+from dtprob.inference import Laplace, fit
+from dtprob.models.declaration import declare
+from dtprob.models.label_twin import label_twin, labelled_rows
+from dtprob.testing import check_effect, check_model
+
+SETTINGS = Settings(replicates=200, site_replicates=39, candidates=4, max_effects=2)
+
+
+def rows(n=300, error=0.3, seed=0, wrong=None):
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1, 1, (n, 3))
+    truth = np.sin(3 * x[:, 0]) + x[:, 1]
+    prediction = truth if wrong is None else wrong(truth, x, rng)
+    return {
+        "x": jnp.asarray(x),
+        "prediction": jnp.asarray(prediction),
+        "y": truth + error * rng.normal(size=n),
+    }
+
+
+def test_model_and_effects_keep_their_contracts():
+    data = rows(n=40)
+    check_model(label_twin, data)
+    effects = catalogue(declare(label_twin, data).sites, data)
+    assert {e.family for e in effects} == {"regional_bias", "scale_bias", "label_noise", "stale_map"}
+    for effect in effects:
+        check_effect(effect, label_twin, data)
+
+
+def test_the_error_is_the_root_mean_square():
+    data = rows()
+    draws = fit(label_twin, data, engine="laplace", key=jax.random.key(0), draws=2000).draws[
+        "error_deviation"
+    ]
+    rms = np.sqrt(np.mean((data["y"] - np.asarray(data["prediction"])) ** 2))
+    assert np.mean(draws) == pytest.approx(rms, rel=0.01)
+    assert np.std(draws) == pytest.approx(rms / np.sqrt(600), rel=0.1)
+
+
+WRONG = {
+    "regional_bias[x2_high]": lambda truth, x, _: truth - 0.5 * (x[:, 2] > 1 / 3),
+    "scale_bias": lambda truth, _x, _rng: 0.6 * truth,
+    "stale_map": lambda truth, x, rng: (
+        truth + 0.5 * rng.normal(size=(4, 4))[tuple(np.floor(2 * x[:, :2] + 2).astype(int).T)]
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_how_the_predictor_errs_is_named(name):
+    data = rows(wrong=WRONG[name])
+    effects = catalogue(declare(label_twin, data).sites, data)
+    found = diagnose(
+        label_twin, data, effects, key=jax.random.key(1), engine=Laplace(draws=200), settings=SETTINGS
+    )
+    assert found.causes[0].effects == (name,)
+    assert found.causes[0].closed_fraction.mean > 0.5
+
+
+def test_a_predictor_without_bias_has_no_gap():
+    data = rows(seed=5)
+    effects = catalogue(declare(label_twin, data).sites, data)
+    found = diagnose(
+        label_twin, data, effects, key=jax.random.key(1), engine=Laplace(draws=200), settings=SETTINGS
+    )
+    assert found.verdict == "NO_GAP"
+
+
+def test_labelled_rows():
+    x, y = np.arange(6.0).reshape(3, 2), np.array([1.0, np.nan, 3.0])
+    data = Labels(x=x, y=np.nan_to_num(y), labelled=np.array([1, 0, 1]), prediction=np.array([1.0, 2.0, 2.5]))
+    taken = labelled_rows(data)
+    np.testing.assert_array_equal(taken["y"], [1.0, 3.0])
+    np.testing.assert_array_equal(taken["x"], x[[0, 2]])
+    without = Labels(x=x, y=np.nan_to_num(y), labelled=np.array([1, 0, 1]))
+    with pytest.raises(InputError, match="expected a prediction of each row, got none"):
+        labelled_rows(without)
