@@ -24,7 +24,7 @@ def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code:
         prepared = prepare_case(chosen(case, engine, seed), job, "fit", ("summary.json",))
         posterior = infer(prepared, prepared.data, out / "posterior.nc", job)
         if "reason" in posterior.provenance:
-            say(f"{posterior.provenance['engine']} was chosen: {posterior.provenance['reason']}")
+            say(f"{posterior.provenance['chosen']} was chosen: {posterior.provenance['reason']}")
         summary = summarise(posterior)
         summary["provenance"] |= prepared.provenance
         write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")

@@ -44,7 +44,7 @@ class Auto(AbstractEngine):
 
     Exact where the posterior has a closed form; the No-U-Turn sampler where that is affordable; von Mises EM
     for many angles of the class it serves exactly; variational inference otherwise. The provenance has the
-    chosen `engine`, `chosen_by` and `reason`.
+    name of the `chosen` engine and the `reason`.
 
     Attributes:
         draws: of the chosen engine; by chain where it has several.
@@ -63,7 +63,7 @@ class Auto(AbstractEngine):
         check_key(key)
         engine, reason = choose(model, data, draws=self.draws)
         posterior = engine(key, model, data, options=options)
-        chosen = {"chosen_by": self.name, "reason": reason}
+        chosen = {"chosen_by": self.name, "chosen": engine.name, "reason": reason}
         return dataclasses.replace(posterior, provenance={**posterior.provenance, **chosen})
 
 

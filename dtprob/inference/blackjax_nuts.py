@@ -115,7 +115,7 @@ def _density(target: Target, place: Place) -> Callable[[Array], Array]:
 
 @dataclass(frozen=True)
 class BlackJAXNUTS(AbstractNoUTurn):
-    """The No-U-Turn sampler of BlackJAX; the settings and promises are those of `nuts`."""
+    """The No-U-Turn sampler of BlackJAX; promises and settings are those of `nuts`."""
 
     name: ClassVar[str] = "blackjax_nuts"
 

@@ -84,7 +84,10 @@ def _without_keys(state: HMCState) -> HMCState:
 
 @dataclass(frozen=True)
 class NUTS(AbstractNoUTurn):
-    """The No-U-Turn sampler of NumPyro; the settings are those of `AbstractNoUTurn`."""
+    """The No-U-Turn sampler of NumPyro, exact in the limit of many draws.
+
+    The settings are those of `dtprob.inference.no_u_turn.AbstractNoUTurn`.
+    """
 
     name: ClassVar[str] = "nuts"
 

@@ -167,7 +167,7 @@ class SVI(AbstractEngine):
             recent = jnp.append(before.recent[1:], elbo)
             if elbo - recent[0] >= jnp.maximum(self.tolerance, error):
                 return moved._replace(recent=recent), {"elbo": elbo}
-            start_anew = jnp.full_like(recent, -jnp.inf)
+            start_anew = jnp.full_like(recent, -jnp.inf).at[-1].set(elbo)
             return moved._replace(recent=start_anew, falls=before.falls + 1), {"elbo": elbo}
 
         return Steps(

@@ -62,7 +62,7 @@ def test_the_reason_is_kept_in_the_file(tmp_path):
     posterior = Auto(draws=20)(KEY, normal, normal_data())
     posterior.save(tmp_path / "posterior.nc")
     facts = Posterior.load(tmp_path / "posterior.nc").provenance
-    assert (facts["engine"], facts["chosen_by"]) == ("exact", "auto")
+    assert (facts["engine"], facts["chosen_by"], facts["chosen"]) == ("exact", "auto", "exact")
     assert "quadratic" in facts["reason"]
 
 
