@@ -107,11 +107,16 @@ def _seen(detectable: list[Detectable]) -> str:
 
 def _listed(report: Report) -> Story:
     cause = report["causes"][0]
+    rest = (
+        "What is left is not chance, but small beside the cause."
+        if report["unlisted"]["sites"]
+        else "What is left is no more than chance."
+    )
     return Story(
         "Cause found",
         "found",
         f"The gap comes from {_named(cause)}.",
-        f"{_closing(cause)} What is left is no more than chance.{_looks_alike(cause)}",
+        f"{_closing(cause)} {rest}{_looks_alike(cause)}",
         _change(cause),
     )
 

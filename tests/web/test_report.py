@@ -189,6 +189,15 @@ def test_without_an_accepted_cause_nothing_is_shown_as_after(
     assert not any("after" in label for label in labels)
 
 
+def test_a_small_remainder_is_not_called_chance(examples: dict[str, Any]) -> None:
+    report = examples["LISTED"]()
+    assert "What is left is no more than chance." in Page(render(report, None, title="x")).text
+    report["unlisted"] = {"p_value": 1e-9, "sites": ["path_gain"]}
+    text = Page(render(report, None, title="x")).text
+    assert "no more than chance" not in text
+    assert "What is left is not chance, but small beside the cause." in text
+
+
 def test_unconfirmed_signs_are_not_called_a_gap(examples: dict[str, Any]) -> None:
     report = examples["UNDETERMINED"]()
     report["causes"] = [{**report["causes"][0], "alias_class": [["device_disconnected[3]"]]}]
