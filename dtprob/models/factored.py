@@ -47,7 +47,7 @@ class Factor:
         name: of the factor; its logits are the site `name_logits`.
         child: the column that it explains, whole numbers from 0.
         parents: the columns that the child depends on, in the law's order.
-        law: from the parents to logits.
+        law: from the parents to logits; without parents it may give those of one slot, (outcome,).
         axes: the child's axes after `episode` and `slot`.
         where: a column that is true where the child counts; everywhere if none is named.
     """
@@ -188,7 +188,9 @@ def draw_factors(factors: Sequence[Factor], columns: Columns) -> dict[str, Array
     """
     known = dict(columns)
     for factor in factors:
-        logits = factor.law(known)
+        logits = jnp.asarray(factor.law(known))
+        if logits.ndim == 1:  # a law without parents: the same in every slot
+            logits = jnp.broadcast_to(logits, (*next(iter(known.values())).shape[:2], len(logits)))
         logits = cast("Array", numpyro.deterministic(f"{factor.name}_logits", logits))
         law: Any = dist.Categorical(logits=logits)
         with ExitStack() as plates:

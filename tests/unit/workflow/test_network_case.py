@@ -29,6 +29,8 @@ reference = "before.csv"
 use = ["device_disconnected", "arrival_rate_shift", "reception_shift"]
 [engine]
 name = "{engine}"
+[engine.options]
+draws = 300
 """
 
 
