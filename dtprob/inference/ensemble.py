@@ -1,12 +1,12 @@
 """Ensembles: one estimate for each of many data sets like the one observed.
 
 With point estimates this is randomised maximum a posteriori. A member maximises the posterior density of data
-with noise added anew (or re-weighted), tilted by the prior's score at a draw from the prior. For a Gaussian
-prior the tilt moves the prior's mean to that draw; so with a linear model and Gaussian noise each member is
-an independent, exact draw from the posterior (Bardsley, Solonen, Haario and Laine, Randomize-then-optimize,
-2014; Oliver, He and Reynolds, Conditioning permeability fields to pressure data, 1996). Elsewhere it is an
-approximation. With an engine that draws, it is the bagged posterior (Huggins and Miller, Robust and
-reproducible model selection using bagged posteriors, 2019).
+with noise added anew (or re-weighted), under the prior shifted by the difference of two draws from it over
+sqrt(2): for a Gaussian prior, by a draw of its own covariance. With a linear model and Gaussian noise each
+member then is an independent, exact draw from the posterior (Bardsley, Solonen, Haario and Laine,
+Randomize-then-optimize, 2014; Oliver, He and Reynolds, Conditioning permeability fields to pressure data,
+1996). Elsewhere it is an approximation. With an engine that draws, it is the bagged posterior (Huggins and
+Miller, Robust and reproducible model selection using bagged posteriors, 2019).
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Ensemble(AbstractEngine):
         resample: "noise" adds noise drawn from the fitted model to normal data; "weights" gives each of the
             model's clusters a random weight, "clusters" draws them with replacement; "none" leaves data
             alone; "auto" is noise for points from normal data, else weights.
-        perturb_prior: tilt the prior at random too (points only); without it the prior is not spread out.
+        perturb_prior: shift the prior at random too (points only); without it the prior adds no spread.
         starts: from how many points the mode on the data themselves is sought.
         initial: constrained values to start from; sites without one start from the prior.
         max_steps: bound on the steps of each search.
@@ -210,7 +210,7 @@ def _resampled(target: Target, scheme: Scheme, fitted: Array, key: PRNGKeyArray,
 def _block(  # noqa: PLR0917
     target: Target,
     scheme: Scheme,
-    tilts: bool,
+    shifts: bool,
     max_steps: int,
     fitted: Array,
     first: Array,
@@ -222,10 +222,11 @@ def _block(  # noqa: PLR0917
     def one(number: Array) -> tuple[Array, Array]:
         data_key, prior_key = jax.random.split(jax.random.fold_in(key, number))
         arrays = _resampled(target, scheme, fitted, data_key, inputs)
-        slope = _prior_score(target, prior_key, inputs) if tilts else jnp.zeros_like(fitted)
+        shift = _prior_shift(target, prior_key, inputs) if shifts else jnp.zeros_like(fitted)
 
         def objective(u: Array) -> Array:
-            return slope @ _linear(target, u) - target.log_density(u, arrays)
+            prior = target.log_terms(u - shift, inputs)
+            return -(prior.prior + prior.jacobian + target.log_terms(u, arrays).likelihood)
 
         optimum = minimise(objective, fitted, max_steps)
         return optimum.position, optimum.converged
@@ -233,16 +234,7 @@ def _block(  # noqa: PLR0917
     return jax.vmap(one)(first + jnp.arange(_BLOCK))
 
 
-def _linear(target: Target, u: Array) -> Array:
-    """What the tilt is linear in: the coordinates, of angles the sine, which is periodic."""
-    return jnp.where(target.circular, jnp.sin(u), u)
-
-
-def _prior_score(target: Target, key: PRNGKeyArray, inputs: Inputs) -> Float[Array, " dimension"]:
-    """The slope of the log prior density at a draw from it: its mean is zero, its covariance Fisher's."""
-
-    def log_prior(u: Array) -> Array:
-        terms = target.log_terms(u, inputs)
-        return terms.prior + terms.jacobian
-
-    return jax.grad(log_prior)(target.prior_draw(key, inputs))
+def _prior_shift(target: Target, key: PRNGKeyArray, inputs: Inputs) -> Float[Array, " dimension"]:
+    """How far a member's prior is from the model's: mean zero, and the prior's own covariance."""
+    first, second = (target.prior_draw(k, inputs) for k in jax.random.split(key))
+    return (first - second) / jnp.sqrt(2.0)
