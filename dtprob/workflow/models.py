@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
-from dtprob.data import ChannelData, NetworkLog, PowerData
+from dtprob.data import ChannelData, Labels, NetworkLog, PowerData
 from dtprob.models.declaration import Model
 
 
@@ -59,6 +59,11 @@ MODELS: Mapping[str, Entry] = {
     ),
     "multi_access": Entry(
         "dtprob.models.multi_access:multi_access", NetworkLog, arrange="dtprob.models.multi_access:records"
+    ),
+    "prediction_powered": Entry(
+        "dtprob.models.prediction_powered.generalised:prediction_powered",
+        Labels,
+        arrange="dtprob.models.prediction_powered.label_data:label_data",
     ),
 }
 """The models that a CASE can name."""

@@ -1,0 +1,132 @@
+"""From a file of labels to the arguments of the `prediction_powered` model, for a CASE."""
+
+import warnings
+from collections.abc import Generator
+from typing import Any, Final
+
+import jax
+import numpy as np
+from jaxtyping import Float
+
+from dtprob.data import Labels
+from dtprob.errors import InputError, unknown_name
+from dtprob.models.prediction_powered.diagnostics import BiasMap, Region, bias_map, worth
+from dtprob.models.prediction_powered.estimate import estimate
+from dtprob.models.prediction_powered.generalised import Calibration, posterior_data
+from dtprob.models.prediction_powered.losses import LOSSES, named_loss
+from dtprob.models.prediction_powered.predictors import JaxPredictor, Neighbours, Ridge
+from dtprob.models.prediction_powered.sample import Sample
+from dtprob.models.prediction_powered.training import train
+from dtprob.models.prediction_powered.tuning import By
+
+PREDICTORS: Final[dict[str, JaxPredictor]] = {"ridge": Ridge(), "neighbours": Neighbours()}
+"""What can be trained where the file has no predictions."""
+
+_SHOWN: Final = 3
+
+
+def label_data(
+    data: Labels,
+    *,
+    loss: str = "mean",
+    scheme: str = "tuned_cppi",
+    predictor: str = "ridge",
+    folds: int = 5,
+    by: By = "overall",
+    calibration: Calibration = "matrix",
+    intercept: bool = True,
+    level: float = 0.9,
+    seed: int = 0,
+) -> dict[str, Any]:
+    """The arguments of `prediction_powered`, with a warning for whatever its user should know.
+
+    A prediction that the file has is taken to come from one predictor that saw none of the labels. Without
+    one, predictors are trained as the scheme says.
+
+    Args:
+        data: checked rows.
+        loss: "mean", "ols", "logistic" or "poisson".
+        scheme: one of the six.
+        predictor: "ridge" or "neighbours", where the file has no prediction.
+        folds: of the labelled rows, where predictors are trained.
+        by: one lambda "overall", or one per "parameter".
+        calibration: as in `posterior_data`.
+        intercept: whether a regression has a constant besides the features.
+        level: of the intervals that the posterior's width is calibrated for.
+        seed: of folds and splits.
+
+    Raises:
+        InputError: an unknown name, labels that the loss does not allow, fewer labels than folds, training
+            labels of one class.
+    """
+    chosen = named_loss(loss)
+    _check_labels(data, loss)
+    if predictor not in PREDICTORS:
+        raise unknown_name("predictor", predictor, PREDICTORS, "predictor")
+    mine, rest = np.flatnonzero(data.labelled), np.flatnonzero(~data.labelled)
+    design = np.column_stack([np.ones(len(data.x)), data.x]) if intercept else data.x
+    features = {} if loss == "mean" else {"x": design[mine], "x_unlabelled": design[rest]}
+    y = data.y[mine]
+    if not len(rest):
+        sample = Sample(y=y, x=features.get("x"))
+    elif data.prediction is not None:
+        predicted = {"prediction": data.prediction[mine], "prediction_unlabelled": data.prediction[rest]}
+        sample = Sample(y=y, **features, **predicted)
+    else:
+        sample = train(
+            jax.random.key(seed),
+            scheme,
+            PREDICTORS[predictor],
+            x=data.x[mine],
+            y=y,
+            x_unlabelled=data.x[rest],
+            folds=folds,
+            features=features.get("x"),
+            features_unlabelled=features.get("x_unlabelled"),
+            probability=loss == "logistic",
+        )
+    found = estimate(chosen, sample, scheme, by=by, level=level)
+    for sentence in (*worth(found).warnings, *_biases(data, sample)):
+        warnings.warn(sentence, stacklevel=2)
+    return posterior_data(chosen, sample, found, calibration=calibration)
+
+
+def _check_labels(data: Labels, loss: str) -> None:
+    y = data.y[data.labelled]
+    allowed = {"logistic": np.isin(y, (0.0, 1.0)), "poisson": y >= 0}.get(loss, np.ones(len(y), bool))
+    if not allowed.all():
+        wrong = float(y[np.argmin(allowed)])
+        expected = "labels 0 and 1" if loss == "logistic" else "labels from 0 up"
+        others = ", ".join(name for name in LOSSES if name != loss)
+        raise InputError(f"y with loss {loss}", expected, f"{wrong:g}", f"Correct y, or use {others}")
+
+
+def _biases(data: Labels, sample: Sample) -> Generator[str]:
+    """Where the predictor is wrong, in words."""
+    if sample.prediction is None or data.x.shape[1] == 0 or sample.n != data.labelled.sum():
+        return
+    found = bias_map(sample, data.x[data.labelled])
+    for region in found.biased()[:_SHOWN]:
+        size = f"{region.bias.value:+.3g} ({region.bias.low:+.3g} to {region.bias.high:+.3g})"
+        yield f"Labels differ from predictions by {size} {_where(region)}, p = {region.p_value:.1g}."
+    if _is_off(found):
+        low, high = found.scale.low, found.scale.high
+        yield f"Labels go with {found.scale.value:.2f} ({low:.2f} to {high:.2f}) times the predictions."
+
+
+def _is_off(found: BiasMap) -> bool:
+    return found.scale_p_value < 0.05
+
+
+def _where(region: Region) -> str:
+    """The box in words, by the features that bound it."""
+    parts: list[str] = []
+    bounds: Float[np.ndarray, "2 feature"] = np.stack([region.low, region.high])
+    for number, (low, high) in enumerate(bounds.T):
+        if np.isfinite(low) and np.isfinite(high):
+            parts.append(f"x_{number} is from {low:.3g} to {high:.3g}")
+        elif np.isfinite(low):
+            parts.append(f"x_{number} is from {low:.3g} up")
+        elif np.isfinite(high):
+            parts.append(f"x_{number} is below {high:.3g}")
+    return f"where {' and '.join(parts)}" if parts else "everywhere"
