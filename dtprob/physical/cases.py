@@ -16,13 +16,13 @@ from typing import Final
 
 import numpy as np
 
-from dtprob.errors import InputError, unknown_name
 from dtprob.files import atomic_write
 from dtprob.physical.campaign import Plan, Site, describe, make_site
 from dtprob.physical.case_files import write_case
 from dtprob.physical.choose import LISTED, Choice, Kind, choose
 from dtprob.physical.draws import FAMILIES
 from dtprob.physical.impairment import Simulation, measure
+from dtprob.physical.key import checked, write_key
 
 KINDS: Final[tuple[Kind, ...]] = ("null", "listed", "unlisted", "pair", "triple", "alias")
 SHARED: Final = 8
@@ -71,7 +71,7 @@ def generate_cases(
         InputError: an unknown kind or family, or a lambda that no effect can reach.
     """
     plan = Plan() if plan is None else plan
-    lambdas = _checked(kinds, lambda_, families)
+    lambdas = checked(kinds, lambda_, families, known_kinds=KINDS, known_families=FAMILIES)
     (out / "truth").mkdir(parents=True, exist_ok=True)
     sites: dict[int, Site] = {}
     for index in range(count):
@@ -85,23 +85,7 @@ def generate_cases(
             _write(out, index, choice, rng=rng, site=sites[number], plan=plan)
         if progress:
             progress(index + 1, count)
-    return _write_key(out, count, seed, plan)
-
-
-def _checked(
-    kinds: Sequence[Kind], lambda_: float | Sequence[float], families: Sequence[str]
-) -> tuple[float, ...]:
-    for kind in kinds:
-        if kind not in KINDS:
-            raise unknown_name("kinds", kind, KINDS, "kind")
-    for family in families:
-        if family not in FAMILIES:
-            raise unknown_name("families", family, FAMILIES, "family")
-    lambdas = (float(lambda_),) if isinstance(lambda_, int | float) else tuple(map(float, lambda_))
-    if not kinds or not families or not lambdas or min(lambdas) <= 0:
-        got = f"{len(kinds)} kinds, {len(families)} families, lambda {lambdas}"
-        raise InputError("withheld cases", "kinds, families and positive values of lambda", got, "Give them")
-    return lambdas
+    return write_key(out, count, seed, track="channel", convention=CONVENTION, plan=asdict(plan))
 
 
 def _record(out: Path, index: int) -> Path:
@@ -152,19 +136,3 @@ def _gap_db(simulation: Simulation, base: Simulation) -> float | None:
     """Error of the base's mean over the channel's power, dB; None without any."""
     error = np.sum(np.abs(simulation.mean - base.mean) ** 2)
     return float(10 * np.log10(error / np.sum(np.abs(simulation.mean) ** 2))) if error > 0 else None
-
-
-def _write_key(out: Path, count: int, seed: int, plan: Plan) -> Path:
-    cases = [json.loads(_record(out, index).read_text(encoding="utf-8")) for index in range(count)]
-    key = {
-        "format": "dtprob.withheld",
-        "version": 1,
-        "track": "channel",
-        "seed": seed,
-        "convention": CONVENTION,
-        "plan": asdict(plan),
-        "cases": cases,
-    }
-    with atomic_write(out / "key.json") as temporary:
-        temporary.write_text(json.dumps(key, indent=1), encoding="utf-8")
-    return out / "key.json"

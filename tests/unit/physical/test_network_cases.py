@@ -1,0 +1,110 @@
+"""Faults of networks and the withheld cases made of them: laws, information, and the same bytes from the same seed."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dtprob.case import load_case
+from dtprob.data import read
+from dtprob.errors import InputError
+from dtprob.physical.multi_access.cases import generate_cases
+from dtprob.physical.multi_access.fault import Past, subsets
+from dtprob.physical.multi_access.faults import FAMILIES, FOREIGN, LISTED, draw
+from dtprob.physical.multi_access.log import record
+from dtprob.physical.multi_access.network import Network, reception
+
+NETWORK = Network(
+    ((0, 1), (2, 3)),
+    1,
+    np.tile([0.2, 0.35, 0.35, 0.1], (2, 1, 1)),
+    reception([0.9], [0.7, 0.2], [0.3, 0.1], [0.1, 0.05], senders=4),
+)
+
+
+def laws(fault, size, past):
+    from dtprob.physical.multi_access.log import _sound_acks
+
+    rows, acks = NETWORK.arrival[:, 0], _sound_acks(NETWORK)
+    rows = fault.arrivals(rows, past, size) if fault.arrivals else rows
+    return rows, fault.acks(acks, past, size) if fault.acks else acks
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_every_fault_keeps_laws_and_does_nothing_at_size_zero(family):
+    fault = draw(np.random.default_rng(0), family, NETWORK)
+    sound = laws(fault, 0.0, Past(7, 0.5, np.ones(4, int)))
+    np.testing.assert_allclose(sound[0], NETWORK.arrival[:, 0], atol=1e-12)
+    np.testing.assert_allclose(sound[1].sum(axis=1), 1, atol=1e-12)
+    past = Past(7, 0.9, np.ones(4, int), memory=fault.start(0.4))
+    rows, acks = laws(fault, 0.4, past)
+    np.testing.assert_allclose(rows.sum(axis=1), 1, atol=1e-12)
+    np.testing.assert_allclose(acks.sum(axis=1), 1, atol=1e-12)
+    assert min(rows.min(), acks.min()) >= 0
+    sets = subsets(4)
+    assert np.all(acks[~np.all(sets[None] <= sets[:, None], axis=2)] == 0)
+    assert not (np.allclose(rows, sound[0]) and np.allclose(acks, sound[1]))
+
+
+def test_log_follows_the_laws():
+    log = record((0,), NETWORK, 20_000).log
+    joint = 2 * log.arrival[:, 0] + log.arrival[:, 1]
+    frequency = np.bincount(joint, minlength=4) / len(joint)
+    np.testing.assert_allclose(frequency, NETWORK.arrival[0, 0], atol=4 * np.sqrt(0.25 / 20_000))
+    senders = (log.action * (log.buffer > 0)).sum(axis=1)
+    for count in (1, 2):
+        seen = log.ack[senders == count].sum(axis=1)
+        expected = NETWORK.reception[count, : count + 1]
+        error = 4 * np.sqrt(0.25 / len(seen))
+        np.testing.assert_allclose(np.bincount(seen, minlength=count + 1) / len(seen), expected, atol=error)
+
+
+def test_information_is_that_of_the_likelihood_ratio():
+    """A source more at one device: the divergence per slot is that of two rows of a table."""
+    fault = draw(np.random.default_rng(0), "arrival_rate_shift", NETWORK)
+    found = record((1,), NETWORK, 500, [(fault, 0.3)]).divergence
+    device = int(fault.instance.split("_")[1])
+    row, has = NETWORK.arrival[0, 0], (np.arange(4) >> (1 - device % 2)) & 1
+    new = np.where(has == 1, row + 0.3 * row[np.arange(4) ^ (2 if device % 2 == 0 else 1)], 0.7 * row)
+    assert found == pytest.approx(500 * np.sum(new * np.log(new / row)), rel=1e-9)
+
+
+def test_an_outage_is_remembered():
+    fault = draw(np.random.default_rng(0), "bursty_channel", NETWORK)
+    bad = fault.start(0.2)
+    heard = fault.follow(bad, 0.5, False, 0.2)
+    silent = fault.follow(bad, 0.1, True, 0.2)
+    assert heard == pytest.approx(0.2 / 0.8 / 8)
+    assert silent > bad > heard
+    share = np.mean(record((2,), NETWORK, 20_000, [(fault, 0.2)]).log.ack.sum(1) == 0)
+    assert share > np.mean(record((2,), NETWORK, 20_000).log.ack.sum(1) == 0)
+
+
+def test_cases(tmp_path):
+    for name in ("first", "second"):
+        generate_cases(tmp_path / name, 4, 3, lambda_=100.0)
+    files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*.*"))
+    assert [file.read_bytes() for file in (tmp_path / "first" / f for f in files)] == [
+        file.read_bytes() for file in (tmp_path / "second" / f for f in files)
+    ]
+    key = json.loads((tmp_path / "first" / "key.json").read_text())
+    assert key["track"] == "network"
+    assert [case["kind"] for case in key["cases"]] == ["null", "listed", "unlisted", "pair"]
+    assert [len(case["effects"]) for case in key["cases"]] == [0, 1, 1, 2]
+    for case in key["cases"]:
+        folder = tmp_path / "first" / "cases" / case["name"]
+        assert load_case(folder / "case.toml").model.name == "multi_access"
+        assert len(read(folder / "after.csv").slot) == 600
+        for effect in case["effects"]:
+            assert effect["lambda"] == pytest.approx(100, rel=0.15)
+    unlisted = key["cases"][2]
+    family = unlisted["effects"][0]["family"]
+    assert unlisted["excluded"] == ([] if family in FOREIGN else [family])
+
+
+def test_wrong_requests(tmp_path):
+    assert set(LISTED) | set(FOREIGN) == set(FAMILIES)
+    with pytest.raises(InputError, match="kinds"):
+        generate_cases(tmp_path, 1, 0, kinds=("triple",))
+    with pytest.raises(InputError, match="family of faults"):
+        draw(np.random.default_rng(0), "weather", NETWORK)
