@@ -57,6 +57,9 @@ MODELS: Mapping[str, Entry] = {
         ChannelData,
         {name: f"dtprob.models.ultra_wideband:{name}" for name in ("rough_delay", "link_power")},
     ),
+    "label_twin": Entry(
+        "dtprob.models.label_twin:label_twin", Labels, arrange="dtprob.models.label_twin:labelled_rows"
+    ),
     "multi_access": Entry(
         "dtprob.models.multi_access:multi_access", NetworkLog, arrange="dtprob.models.multi_access:records"
     ),

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dtprob.case import load_case
 from dtprob.data import Labels
 from dtprob.effects import catalogue
 from dtprob.errors import InputError
@@ -14,6 +15,7 @@ from dtprob.inference import Laplace, fit
 from dtprob.models.declaration import declare
 from dtprob.models.label_twin import label_twin, labelled_rows
 from dtprob.testing import check_effect, check_model
+from dtprob.workflow.prepare import prepare
 
 SETTINGS = Settings(replicates=200, site_replicates=39, candidates=4, max_effects=2)
 
@@ -87,3 +89,14 @@ def test_labelled_rows():
     without = Labels(x=x, y=np.nan_to_num(y), labelled=np.array([1, 0, 1]))
     with pytest.raises(InputError, match="expected a prediction of each row, got none"):
         labelled_rows(without)
+
+
+def test_a_case(tmp_path):
+    data = {name: np.asarray(value) for name, value in rows(n=60).items()}
+    data["y"] = np.where(np.arange(60) < 40, data["y"], np.nan)
+    np.savez(tmp_path / "labels.npz", **data)
+    text = '[model]\nname = "label_twin"\n[data]\nfile = "labels.npz"\n[engine]\nname = "laplace"\n'
+    (tmp_path / "case.toml").write_text(text)
+    job = prepare(load_case(tmp_path / "case.toml"), need="diagnosis")
+    assert job.data["y"].shape == (40,)
+    assert "regional_bias[x2_high]" in {effect.name for effect in job.effects}
