@@ -91,7 +91,8 @@ def figure(
         lambda: {"throughput": remembering(true_key, campaign)},
     )
     best = progress.part(
-        f"local rules, {campaign.budget.slots} virtual slots", lambda: local_rules(true_key, oracle["table"])
+        f"local rules, {campaign.budget.slots} virtual slots",
+        lambda: local_rules(true_key, oracle["table"], campaign.starts),
     )["throughput"]
     lines = {"oracle": oracle["metric"], "tdma": _fixed("tdma"), "aloha": _fixed("aloha")}
     panels = tuple(
@@ -145,7 +146,7 @@ def remembering(key: PRNGKeyArray, campaign: Campaign, runs: int = 3) -> Float[n
 
 
 def local_rules(
-    key: PRNGKeyArray, trained: Float[np.ndarray, "run phase device buffer arrival ack"], starts: int = 12
+    key: PRNGKeyArray, trained: Float[np.ndarray, "run phase device buffer arrival ack"], starts: int
 ) -> dict[str, np.ndarray]:
     """Throughput of rules that no single decision improves, from trained and random ones and from time slots."""
     exact = chain(NETWORK)

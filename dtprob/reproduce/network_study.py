@@ -127,11 +127,13 @@ class Campaign(NamedTuple):
         learner: that trains them.
         budget: virtual slots of each training.
         kernel: the transition that is trained on.
+        starts: random rules from which the best local rule is sought.
     """
 
     learner: Learner = COMA()
     budget: Budget = Budget(slots=120_000)
     kernel: Kernel = TWIN
+    starts: int = 12
 
     def policies(
         self, key: PRNGKeyArray, samplers: Sequence[Sampler]

@@ -1,0 +1,120 @@
+"""How fast data teach the reception of the network: collected at random, or by a policy trained to learn.
+
+The policy is trained by COMA on networks drawn from the prior, with the information of each slot about all tables as
+reward; it is a frame policy of 8 slots. It is judged on the real network.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PRNGKeyArray
+
+from dtprob.control import (
+    COMA,
+    Budget,
+    Counts,
+    DirichletInformation,
+    Environment,
+    FramePolicy,
+    TablePolicy,
+    draw_pool,
+    tabulate,
+    train,
+)
+from dtprob.models.multi_access import Clusters, priors
+from dtprob.physical.multi_access import Network
+from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
+from dtprob.reproduce.network_study import NETWORK, TWIN, collect, counts, law, record
+from dtprob.reproduce.progress import Progress
+
+RUNS: Final = 400
+SLOTS: Final = 40
+CONCENTRATION: Final = 0.5
+TARGETS: Final = (0.3, 0.2, 0.15, 0.1)
+FRAME: Final = 8
+BUDGET: Final = Budget(400_000, 40, SLOTS)
+_DRAWS: Final = 1000
+
+
+def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
+    """The figure; see the module."""
+    return figure(key, runs, progress, BUDGET)
+
+
+def figure(key: PRNGKeyArray, runs: int, progress: Progress, budget: Budget) -> Figure:
+    """The figure for a given training of the policy that collects."""
+    random_key, train_key, play_key = jax.random.split(key, 3)
+
+    def trained() -> dict[str, np.ndarray]:
+        return {"table": collector(train_key, budget)}
+
+    table = progress.part(f"policy that collects, {budget.slots} virtual slots", trained)["table"]
+    curves = {
+        "random": errors(collect(random_key, SLOTS + 1, runs)),
+        "optimised": errors(directed(play_key, table, runs)),
+    }
+    slots = np.arange(1, SLOTS + 1)
+    series = tuple(_mean(name, slots, value) for name, value in curves.items())
+    axes = Quantity("slots of data"), Quantity("error of the reception table")
+    panel = Panel("posterior mean against the truth", *axes, series)
+    return Figure("collection", "collecting data that teach", (panel,), runs, (_MEASURE, *_steps(curves)))
+
+
+_MEASURE: Final = "error: total variation of the posterior mean from the truth, mean over 1 to 4 senders"
+
+
+def collector(key: PRNGKeyArray, budget: Budget) -> Float[np.ndarray, "phase device buffer arrival ack"]:
+    """The table of a policy that is trained to learn as much as it can in an episode."""
+    prior = priors(Clusters(NETWORK.clusters), CONCENTRATION)
+    known = Counts(*(jnp.asarray(prior[name]) for name in ("log_arrival", "log_reception")))
+    nothing = {name: np.zeros_like(table) for name, table in prior.items()}
+    first, second, third = jax.random.split(key, 3)
+    pool = draw_pool(first, law(nothing, CONCENTRATION), _DRAWS)
+    reward = DirichletInformation(known, NETWORK.clusters)
+    environment = Environment(TWIN, pool, SLOTS, reward=reward)
+    learner = COMA(scale=1.0, discount=0.98, frame=FRAME)
+    start = FramePolicy(second, NETWORK.devices, FRAME)
+    policy = eqx.filter_jit(train)(third, learner, start, environment, budget).policy
+    return np.asarray(tabulate(policy).probability)
+
+
+def directed(
+    key: PRNGKeyArray, table: Float[np.ndarray, "phase device buffer arrival ack"], runs: int
+) -> dict[str, Float[np.ndarray, "run slot ..."]]:
+    """The counts of each slot of episodes that a policy plays on the real network."""
+    policy = TablePolicy(jnp.asarray(table))
+    played = jax.jit(jax.vmap(lambda k: record(k, policy, SLOTS + 1)))(jax.random.split(key, runs))
+    return counts(jax.tree.map(lambda leaf: np.asarray(leaf)[:, :, 0], played))
+
+
+def errors(
+    seen: Mapping[str, Float[np.ndarray, "run slot ..."]], network: Network = NETWORK
+) -> Float[np.ndarray, "run slot"]:
+    """Error of the reception table's posterior mean after each slot."""
+    prior = priors(Clusters(network.clusters), CONCENTRATION)["log_reception"]
+    posterior = prior + seen["log_reception"].cumsum(axis=1)
+    mean = posterior / posterior.sum(axis=-1, keepdims=True)
+    distance = 0.5 * np.abs(mean - network.reception).sum(axis=-1)
+    return distance[..., 1:].mean(axis=-1)
+
+
+def _mean(name: str, slots: Sequence[int] | np.ndarray, values: Float[np.ndarray, "run slot"]) -> Series:
+    mean, error = values.mean(axis=0), values.std(axis=0) / np.sqrt(len(values))
+    return Series(name, np.asarray(slots, float), mean, mean - 1.96 * error, mean + 1.96 * error)
+
+
+def _steps(curves: Mapping[str, Float[np.ndarray, "run slot"]]) -> tuple[str, ...]:
+    """Slots until the mean error is no larger than each target."""
+
+    def until(name: str, target: float) -> str:
+        below = np.flatnonzero(curves[name].mean(axis=0) <= target)
+        return str(below[0] + 1) if len(below) else f"more than {SLOTS}"
+
+    return tuple(
+        f"error {target}: {until('optimised', target)} slots, at random {until('random', target)}"
+        for target in TARGETS
+    )
