@@ -94,7 +94,7 @@ def coefficients(
         weight = weight * turn
         found[degree] = weight.sum(axis=1)
     found *= _scale(elements)[:, None]
-    return np.concatenate([found.real, found.imag]).T
+    return np.concatenate([np.real(found), np.imag(found)]).T
 
 
 def gathered(

@@ -65,12 +65,15 @@ def label_data(
         raise unknown_name("predictor", predictor, PREDICTORS, "predictor")
     mine, rest = np.flatnonzero(data.labelled), np.flatnonzero(~data.labelled)
     design = np.column_stack([np.ones(len(data.x)), data.x]) if intercept else data.x
-    features = {} if loss == "mean" else {"x": design[mine], "x_unlabelled": design[rest]}
+    features: dict[str, Any] = {} if loss == "mean" else {"x": design[mine], "x_unlabelled": design[rest]}
     y = data.y[mine]
     if not len(rest):
         sample = Sample(y=y, x=features.get("x"))
     elif data.prediction is not None:
-        predicted = {"prediction": data.prediction[mine], "prediction_unlabelled": data.prediction[rest]}
+        predicted: dict[str, Any] = {
+            "prediction": data.prediction[mine],
+            "prediction_unlabelled": data.prediction[rest],
+        }
         sample = Sample(y=y, **features, **predicted)
     else:
         sample = train(

@@ -107,7 +107,7 @@ def _unlabelled(
     if not sample.has_predictions:
         return _empty(theta, n_context)
     total: Group | None = None
-    for chunk in sample.chunks():
+    for chunk in sample.chunks(averaged=loss.traits.linear_in_label):
         sums = _chunk_sums(loss, theta, chunk, n_context)
         total = sums if total is None else jax.tree.map(jnp.add, total, sums)
     if total is None or not all(bool(jnp.all(jnp.isfinite(part))) for part in total):

@@ -155,16 +155,21 @@ class Sample:
         """Contexts of the labelled samples."""
         return np.zeros(self.n, int) if self.context is None else self.context
 
-    def chunks(self) -> Generator[Chunk]:
-        """The unlabelled samples, one chunk after another, all of one size."""
-        if "whole" in self._whole:
-            yield self._whole["whole"]
+    def chunks(self, *, averaged: bool = False) -> Generator[Chunk]:
+        """The unlabelled samples, one chunk after another, all of one size.
+
+        Args:
+            averaged: give the average of all predictors instead of each.
+        """
+        name = "averaged" if averaged else "each"
+        if name in self._whole:
+            yield self._whole[name]
             return
         rows = self.rows_per_chunk
         for start in range(0, self.n_unlabelled, rows):
-            chunk = self._read(slice(start, min(start + rows, self.n_unlabelled)), rows)
+            chunk = self._read(slice(start, min(start + rows, self.n_unlabelled)), rows, averaged=averaged)
             if rows >= self.n_unlabelled:
-                self._whole["whole"] = chunk
+                self._whole[name] = chunk
             yield chunk
 
     @property
@@ -177,14 +182,17 @@ class Sample:
         width = self.features.shape[1] + int(np.prod(shape)) + 2
         return min(max(_CHUNK_NUMBERS // width, 1024), max(self.n_unlabelled, 1))
 
-    def _read(self, rows: slice, size: int) -> Chunk:
+    def _read(self, rows: slice, size: int, *, averaged: bool) -> Chunk:
         count = rows.stop - rows.start
         x = np.zeros((count, 0)) if self.x_unlabelled is None else self.x_unlabelled[rows]
         given = self.prediction_unlabelled
         prediction: Any = given(np.asarray(x)) if callable(given) else given[rows]
         shape = _prediction_shape(np.shape(prediction), count, self.y.shape[1:])
-        weight = np.ones(count) if self.weight_unlabelled is None else self.weight_unlabelled[rows]
-        context = np.zeros(count, int) if self.context_unlabelled is None else self.context_unlabelled[rows]
+        if averaged and shape[1] > 1:
+            columns = np.moveaxis(np.asarray(prediction), 1, -1)
+            prediction, shape = columns @ np.full(shape[1], 1 / shape[1]), (count, 1, *shape[2:])
+        weight = jnp.ones(count) if self.weight_unlabelled is None else self.weight_unlabelled[rows]
+        context = jnp.zeros(count, int) if self.context_unlabelled is None else self.context_unlabelled[rows]
         short = size - count
 
         def filled(array: Any, shape: tuple[int, ...]) -> Array:
