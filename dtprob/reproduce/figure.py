@@ -150,6 +150,8 @@ def draw(figure: Figure) -> Any:
 
 
 def _draw(place: Any, panel: Panel) -> None:
+    from matplotlib.ticker import LogLocator, NullFormatter  # noqa: PLC0415  (slow to import)
+
     markers = "osD^vP*X"
     for number, series in enumerate(panel.series):
         (line,) = place.plot(
@@ -158,8 +160,15 @@ def _draw(place: Any, panel: Panel) -> None:
         if np.any(series.low != series.high):
             place.fill_between(series.x, series.low, series.high, alpha=0.15, color=line.get_color(), lw=0)
     place.set(title=panel.title, xlabel=panel.x.label, ylabel=panel.y.label)
-    place.set_xscale("log" if panel.x.is_log else "linear")
-    place.set_yscale("log" if panel.y.is_log else "linear")
+    for axis, quantity, scale in (
+        (place.xaxis, panel.x, place.set_xscale),
+        (place.yaxis, panel.y, place.set_yscale),
+    ):
+        if quantity.is_log:
+            scale("log")
+            axis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.set_major_formatter("{x:g}")
+            axis.set_minor_formatter(NullFormatter())
     place.legend(fontsize=7, ncols=2 if len(panel.series) > 6 else 1)
 
 
