@@ -100,7 +100,7 @@ def responses(links: int, paths: int, subcarriers: int) -> np.ndarray:
 MODELS: Mapping[str, tuple[Callable[..., None], np.ndarray]] = {
     "linear": (linear, regressors(100, 20)),
     "logistic": (logistic, regressors(200, 10)),
-    "phases": (phases, responses(5, 3, 16)),
+    "phases": (phases, responses(2, 3, 16)),
 }
 
 
@@ -145,7 +145,7 @@ def reference_of(model: Callable[..., None], data: dict[str, Any]) -> Posterior:
     try:
         return resolve("exact", draws=20_000)(jax.random.key(9), model, data, options=LEAN)
     except InputError:
-        return NUTS(warmup=1000, draws=3000, chains=2)(jax.random.key(9), model, data, options=LEAN)
+        return NUTS(warmup=1000, draws=2000, chains=2)(jax.random.key(9), model, data, options=LEAN)
 
 
 def measured(
