@@ -27,8 +27,7 @@ LEVEL: Final = 0.9
 METRICS: Final = {"throughput": throughput}
 _TRUTH: Final = Network.reference()
 _CLUSTERS: Final = Clusters(_TRUTH.clusters)
-_PRIOR: Final = {"bayesian": 0.01, "bayesian_overall": None, "bayesian_jeffreys": 0.5}
-"""Concentration of each outcome; None for one over the number of outcomes."""
+_PRIOR: Final = {"bayesian": 0.01, "bayesian_jeffreys": 0.5}
 _MODE: Final = 1.01
 _TWIN: Final = kernel(_TRUTH.clusters)
 _POLICY: Final = random_access(_CLUSTERS.devices, 0.4)
@@ -47,8 +46,7 @@ def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
     }
     notes = [
         f"Random access with probability 0.4; horizon {HORIZON} slots; {_DRAWS} draws, {_EPISODES} episodes of each.",
-        "bayesian: prior concentration .01; bayesian_overall: one over the number of outcomes; bayesian_jeffreys: .5.",
-        "map: the mode under concentration 1.01, with the network's own randomness only.",
+        "bayesian: prior concentration .01; bayesian_jeffreys: .5; map: the mode under 1.01, its own randomness only.",
     ]
     panels: list[Panel] = []
     for metric in METRICS:
@@ -131,22 +129,17 @@ class _InTurn:
 
 def _samplers(counts: Mapping[str, np.ndarray]) -> dict[str, Sampler]:
     """The samplers of some twins together."""
-    allowed = {name: value > 0 for name, value in priors(_CLUSTERS, 1.0).items()}
 
-    def prior(a: float | None) -> dict[str, np.ndarray]:
-        own = {
-            n: np.where(m, 1.0 / m.sum(axis=-1, keepdims=True) if a is None else a, 0.0)
-            for n, m in allowed.items()
+    def repeated(a: float) -> dict[str, np.ndarray]:
+        return {
+            name: np.broadcast_to(value, counts[name].shape) for name, value in priors(_CLUSTERS, a).items()
         }
-        return {name: np.broadcast_to(value, counts[name].shape) for name, value in own.items()}
 
     found: dict[str, Sampler] = {
-        name: _InTurn(DirichletTables(prior(a)).updated(counts)) for name, a in _PRIOR.items()
+        name: _InTurn(DirichletTables(repeated(a)).updated(counts)) for name, a in _PRIOR.items()
     }
-    mode = {
-        name: log_shares(value + _MODE - 1, np.broadcast_to(allowed[name], value.shape))
-        for name, value in counts.items()
-    }
+    allowed = {name: value > 0 for name, value in repeated(1.0).items()}
+    mode = {name: log_shares(value + _MODE - 1, allowed[name]) for name, value in counts.items()}
     return {**found, "map": _InTurn(PointMass(mode))}
 
 
