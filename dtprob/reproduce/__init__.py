@@ -12,6 +12,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "prediction": "dtprob.reproduce.prediction",
     "fig9": "dtprob.reproduce.fig9",
     "fig10": "dtprob.reproduce.fig10",
+    "fig10_learned": "dtprob.reproduce.fig10_learned",
     "label_grid": "dtprob.reproduce.label_grid",
     "deepsense": "dtprob.reproduce.deepsense",
 }

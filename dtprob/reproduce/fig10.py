@@ -1,10 +1,9 @@
 """Rate after beam alignment against the number of labelled positions, for an array of 200 antennas.
 
-Besides the user with one antenna: one with two, so that a pair of beams is chosen, and the map of a Gaussian
-process in the place of the inverse-distance one.
+Besides the user with one antenna: one with two, so that a pair of beams is chosen.
 """
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 import numpy as np
@@ -22,9 +21,6 @@ from dtprob.reproduce.progress import Progress
 RUNS: Final = beam_alignment.RUNS
 ROWS: Final = 20
 LABELLED: Final = (100, 200, 300, 500, 1000, 2000, 3000)
-FEW: Final = 1000
-"""Most labels for which the map of a Gaussian process is made: its cost grows with their square."""
-
 _STATED: Final = 300
 _LEVEL: Final = 0.9
 
@@ -36,23 +32,25 @@ def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
 
 def figure(campaign: Campaign, labelled: Sequence[int]) -> Figure:
     """The figure for given numbers of labels."""
-    one, two = Arrays(ROWS), Arrays(ROWS, user=2)
-    kinds = {
-        "user with one antenna": (one, "inverse_distance"),
-        "user with two antennas: a pair of beams": (two, "inverse_distance"),
-        "user with one antenna, map of a Gaussian process": (one, "gaussian_process"),
+    cases = {
+        "user with one antenna": Case(Arrays(ROWS), 0),
+        "user with two antennas: a pair of beams": Case(Arrays(ROWS, user=2), 0),
     }
+    return drawn("fig10", campaign, cases, labelled)
+
+
+def drawn(name: str, campaign: Campaign, cases: Mapping[str, Case], labelled: Sequence[int]) -> Figure:
+    """A figure with a panel per case, whose number of labels is on the axis."""
     panels: list[Panel] = []
     notes: list[str] = []
-    for title, (arrays, kind) in kinds.items():
-        shown = [n for n in labelled if kind != "gaussian_process" or n <= FEW]
-        table = np.stack([campaign.cell(Case(arrays, n, kind)) for n in shown], axis=-1)
-        curves = [Series.of_runs(name, shown, table[:, i, 0]) for i, name in enumerate(SCHEMES)]
+    for title, case in cases.items():
+        table = np.stack([campaign.cell(case._replace(n=n)) for n in labelled], axis=-1)
+        curves = [Series.of_runs(scheme, labelled, table[:, i, 0]) for i, scheme in enumerate(SCHEMES)]
         axis = Quantity("labelled positions", is_log=True)
         panels.append(Panel(title, axis, RATE, tuple(curves)))
-        notes += [f"{title}: {text}" for text in _findings(table, shown)]
-    title = f"beam alignment with synthetic labels, {one.antennas} antennas"
-    return Figure("fig10", title, tuple(panels), campaign.runs, (*campaign.notes, *notes))
+        notes += [f"{title}: {text}" for text in _findings(table, labelled)]
+    title = f"beam alignment with synthetic labels, {Arrays(ROWS).antennas} antennas"
+    return Figure(name, title, tuple(panels), campaign.runs, (*campaign.notes, *notes))
 
 
 def _findings(table: Float[np.ndarray, "run scheme 2 point"], labelled: Sequence[int]) -> list[str]:
