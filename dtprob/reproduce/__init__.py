@@ -8,6 +8,7 @@ from typing import Final
 
 FIGURES: Final[Mapping[str, str]] = {
     "fig3": "dtprob.reproduce.fig3",
+    "collection": "dtprob.reproduce.network_collection",
     "fig2": "dtprob.reproduce.fig2",
     "prediction": "dtprob.reproduce.prediction",
     "fig9": "dtprob.reproduce.fig9",

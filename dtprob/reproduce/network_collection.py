@@ -34,7 +34,8 @@ from dtprob.reproduce.progress import Progress
 RUNS: Final = 400
 SLOTS: Final = 40
 CONCENTRATION: Final = 0.5
-TARGETS: Final = (0.3, 0.2, 0.15, 0.1)
+"""Of the prior. With that of control, 0.01, a row counts as known after a single outcome."""
+TARGETS: Final = (0.4, 0.3, 0.25, 0.2)
 FRAME: Final = 8
 BUDGET: Final = Budget(400_000, 40, SLOTS)
 _DRAWS: Final = 1000
