@@ -190,7 +190,8 @@ class Sample:
         shape = _prediction_shape(np.shape(prediction), count, self.y.shape[1:])
         if averaged and shape[1] > 1:
             columns = np.moveaxis(np.asarray(prediction), 1, -1)
-            prediction, shape = columns @ np.full(shape[1], 1 / shape[1]), (count, 1, *shape[2:])
+            share = np.full(shape[1], 1 / shape[1])
+            prediction, shape = np.einsum("...k,k->...", columns, share), (count, 1, *shape[2:])
         weight = jnp.ones(count) if self.weight_unlabelled is None else self.weight_unlabelled[rows]
         context = jnp.zeros(count, int) if self.context_unlabelled is None else self.context_unlabelled[rows]
         short = size - count
