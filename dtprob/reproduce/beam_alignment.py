@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float, Int, PRNGKeyArray
 from dtprob.models.prediction_powered.multioutput import Labelled, Unlabelled, regress
 from dtprob.models.prediction_powered.schemes import SCHEMES
 from dtprob.models.prediction_powered.training import assign_folds
-from dtprob.reproduce.beam_maps import MAPPED_PATHS, MAPS, NEIGHBOURS, Map, waves
+from dtprob.reproduce.beam_maps import MAPS, Map, waves
 from dtprob.reproduce.beams import BeamPaths, Site
 from dtprob.reproduce.beams_codebook import Arrays, chosen, labels, rates
 from dtprob.reproduce.figure import Quantity
@@ -79,10 +79,9 @@ class Campaign(NamedTuple):
         site, count = Site(), len(self.paths.position)
         where = f"{count} positions of the scene {site.scene} at {site.frequency / 1e9:g} GHz"
         student = f"student of {FEATURES} random Fourier features"
-        map_ = f"inverse-distance map of {NEIGHBOURS} neighbours and {MAPPED_PATHS} paths"
         return (
             f"{where}, rates at {min(TESTED, count)} of those without a label",
-            f"{student}, {map_}, {FOLDS} folds",
+            f"{student}, {FOLDS} folds",
         )
 
 
