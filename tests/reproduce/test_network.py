@@ -1,12 +1,15 @@
-"""The studies of the network: data are counted right, twins are what they should be, errors vanish in the limit."""
+"""Figure 2 and the collection study in small: data are counted right, twins are what they should be, all parts fit."""
+
+import json
 
 import jax
 import numpy as np
 import pytest
 
-from dtprob.control import aloha
-from dtprob.reproduce import network_collection
-from dtprob.reproduce.network_study import NETWORK, collect, counts, law, learned, mode, record
+from dtprob.control import COMA, Budget, aloha
+from dtprob.reproduce import fig2, network_collection
+from dtprob.reproduce.network_study import NETWORK, Campaign, collect, counts, law, learned, mode, record
+from dtprob.reproduce.progress import Progress
 
 KEY = jax.random.key(0)
 ZERO = {"log_arrival": np.zeros((2, 1, 4)), "log_reception": np.zeros((5, 5))}
@@ -50,6 +53,20 @@ def test_points_are_the_textbooks():
     mean, total = np.array([0.01, 3.01, 1.01]) / 4.03, 4.03
     error = 4 * np.sqrt(mean * (1 - mean) / (total + 1) / 4000)
     assert np.all(np.abs(drawn.mean(axis=0) - mean) < error)
+
+
+def test_the_figure_in_small(tmp_path):
+    campaign = Campaign(COMA(), Budget(640, 8, 20), starts=0)
+    found = fig2.figure(KEY, 2, Progress(folder=tmp_path / "parts"), (0, 4), campaign)
+    names = [series.name for series in found.panels[0].series]
+    assert names == ["bayesian", "map", "maximum_likelihood", "oracle", "tdma", "aloha"]
+    level = {series.name: series.median for series in found.panels[0].series}
+    np.testing.assert_allclose(level["tdma"], 1.0598, atol=5e-5)
+    np.testing.assert_allclose(level["aloha"], 0.7786, atol=5e-5)
+    assert all(0.3 < value < 1.1625 for values in level.values() for value in values)
+    assert json.dumps(found.to_dict(seed=0, command="", seconds=1.0))
+    kept = len(list((tmp_path / "parts").iterdir()))
+    assert kept == 2 * 3 + 3  # methods and sizes; oracle, policies that remember, local rules
 
 
 def test_errors_fall_with_counts_and_are_zero_in_the_limit():
