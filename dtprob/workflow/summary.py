@@ -13,6 +13,7 @@ LARGEST = 1000
 """Sites with more entries than this are only named: their draws are in posterior.nc."""
 ENOUGH_DRAWS = 400.0
 LARGEST_R_HAT = 1.01
+LARGEST_PARETO_K = 0.7
 
 
 def summarise(posterior: Posterior) -> dict[str, Any]:
@@ -61,6 +62,10 @@ def _warnings(rows: dict[str, dict[str, Any]], diverging: int, posterior: Poster
     few = [name for name, row in rows.items() if row.get("ess", math.inf) < ENOUGH_DRAWS]
     if few and posterior.chains > 1:
         yield f"Fewer than {ENOUGH_DRAWS:.0f} effective draws of {_some(few)}: run longer."
+    if not np.all(posterior.extra.get("converged", True)):
+        yield "The search or the fit of the engine did not converge: give it more steps, or more starts."
+    if float(np.max(posterior.extra.get("pareto_k", 0.0))) > LARGEST_PARETO_K:
+        yield f"The approximation is poor (Pareto k above {LARGEST_PARETO_K}): confirm with nuts."
 
 
 def _some(labels: list[str]) -> str:

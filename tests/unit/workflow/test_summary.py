@@ -34,6 +34,15 @@ def test_doubtful_chains_are_named():
     assert warnings[2].startswith("Fewer than 400 effective draws of apart")
 
 
+def test_doubtful_approximations_are_named():
+    draws = {"a": np.random.default_rng(3).normal(size=(1, 50))}
+    extra = {"converged": np.asarray(False), "pareto_k": np.asarray(0.9)}
+    warnings = summary.summarise(Posterior(draws=draws, latent=("a",), extra=extra))["warnings"]
+    assert [text.split(" ")[1] for text in warnings] == ["search", "approximation"]
+    extra = {"converged": np.asarray(True), "pareto_k": np.asarray(0.3)}
+    assert summary.summarise(Posterior(draws=draws, latent=("a",), extra=extra))["warnings"] == []
+
+
 def test_one_chain_and_large_sites():
     rng = np.random.default_rng(2)
     found = summary.summarise(posterior(a=rng.normal(size=(1, 50)), big=rng.normal(size=(1, 50, 40, 30))))
