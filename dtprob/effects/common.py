@@ -86,9 +86,10 @@ def is_coherent(sites: Sites, data: Data) -> bool:
     return has_phase(sites) and data.get("phase", "coherent") == "coherent" and not own
 
 
-def reference_power(context: Data) -> jax.Array:
-    """Mean square of the measured channel, the unit of what depends on the level."""
-    return jnp.mean(square(jnp.asarray(context["channel"])))
+def reference_power(data: Data) -> float | None:
+    """Mean square of the measured channel, the unit of what depends on the level; None without data."""
+    channel = data.get("channel")
+    return None if channel is None else float(np.mean(np.abs(np.asarray(channel)) ** 2))
 
 
 def phasor(phase: Float[Array, "*n"]) -> Complex[Array, "*n"]:

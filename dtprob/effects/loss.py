@@ -119,29 +119,35 @@ def path_loss_exponent(sites: Sites, data: Data) -> list[Effect]:
 
 
 def antenna_pattern(sites: Sites, data: Data) -> list[Effect]:
-    """The antennas' gain over direction differs smoothly from the twin's."""
+    """The antennas' gain over direction, or over elevation alone, differs smoothly from the twin's."""
     if not offers(sites, "path_gain") or data.get("paths") is None:
         return []
-    effects = []
-    for side in SIDES:
-
-        def weigh(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], side: str = side) -> Any:
-            direction = getattr(context["paths"], DIRECTION[side])
-            return value * jnp.exp(_harmonics(direction) @ p["log_gain"])
-
-        effects.append(
-            Effect(
-                "antenna_pattern",
-                {"path_gain": weigh},
-                (normal("log_gain", 0.15, "Np", 8),),
-                instance=side,
-                physics=f"Log gain of all {side} antennas over the direction of travel k, in world axes:"
-                " x, y, z, xy, yz, zx, x^2 - y^2, 3 z^2 - 1.",
-                source="Real spherical harmonics of degree 1 and 2, of unit mean square over the sphere.",
-                requires=("paths",),
-            )
+    return [
+        _pattern(side, name, columns, text)
+        for side in SIDES
+        for name, columns, text in (
+            (side, list(range(8)), "x, y, z, xy, yz, zx, x^2 - y^2, 3 z^2 - 1"),
+            (f"{side}_elevation", [2, 7], "z, 3 z^2 - 1, as of a dipole for another one"),
         )
-    return effects
+    ]
+
+
+def _pattern(side: str, instance: str, columns: list[int], text: str) -> Effect:
+    """A pattern made of some of the harmonics."""
+
+    def weigh(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        direction = getattr(context["paths"], DIRECTION[side])
+        return value * jnp.exp(_harmonics(direction)[..., jnp.asarray(columns)] @ p["log_gain"])
+
+    return Effect(
+        "antenna_pattern",
+        {"path_gain": weigh},
+        (normal("log_gain", 0.15, "Np", len(columns)),),
+        instance=instance,
+        physics=f"Log gain of all {side} antennas over the direction of travel k, in world axes: {text}.",
+        source="Real spherical harmonics of degree 1 and 2, of unit mean square over the sphere.",
+        requires=("paths",),
+    )
 
 
 def phase_error(sites: Sites, _data: Data) -> list[Effect]:

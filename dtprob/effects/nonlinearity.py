@@ -32,18 +32,19 @@ _SALEH: Final = (
 
 def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
     """A memoryless amplifier compresses strong signals and turns their phase."""
-    if data.get("channel") is None or not has_phase(sites):
+    power = reference_power(data)
+    if power is None or not has_phase(sites):
         return []
 
-    def compress(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        return value / (1.0 + p["compression"] * square(value) / reference_power(context))
+    def compress(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+        return value / (1.0 + p["compression"] * square(value) / power)
 
-    def compress_all(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        level = jnp.mean(square(value), axis=-1, keepdims=True) / reference_power(context)
+    def compress_all(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+        level = jnp.mean(square(value), axis=-1, keepdims=True) / power
         return value / (1.0 + p["compression"] * level)
 
-    def turn(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        level = square(value) / reference_power(context)
+    def turn(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+        level = square(value) / power
         return value * phasor(p["phase"] * level / (1.0 + level))
 
     compression = (half_normal("compression", 0.1),)
@@ -54,7 +55,6 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
             compression,
             physics="Gain falls with the power of the entry: one tone at a time. Unit: the mean power.",
             source="h / (1 + c |h|^2 / P): " + _SALEH,
-            requires=("channel",),
         ),
         Effect(
             "amplifier_nonlinearity",
@@ -63,7 +63,6 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
             instance="phase",
             physics="Phase turns with the power of the entry; size is the turn far above the mean power.",
             source="h exp(j a x / (1 + x)), x = |h|^2 / P: " + _SALEH,
-            requires=("channel",),
         ),
     ]
     if band(data) is not None:
@@ -74,7 +73,6 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
             instance="wideband",
             physics="Gain falls with the power over the whole band: all subcarriers at a time.",
             source="h / (1 + c mean_k |h|^2 / P): " + _SALEH,
-            requires=("channel",),
         )
         effects.append(wideband)
     return effects
@@ -82,21 +80,17 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
 
 def crosstalk(sites: Sites, data: Data) -> list[Effect]:
     """A constant leaks inside the instrument, on all subcarriers or on the one at the carrier."""
-    measured = band(data)
-    if data.get("channel") is None or not has_phase(sites):
+    power, measured = reference_power(data), band(data)
+    if power is None or not has_phase(sites):
         return []
-
-    def leak(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        return value + jnp.sqrt(reference_power(context)) * complex_of(p["leak"])
-
+    level = float(np.sqrt(power))
     effects = [
         Effect(
             "crosstalk",
-            {"noiseless_channel": leak},
+            {"noiseless_channel": lambda value, p, _: value + level * complex_of(p["leak"])},
             (normal("leak", 0.1, "1", 2),),
             physics="The same complex number is added to every entry; unit: the rms channel.",
             source="h + g sqrt(P), g complex (real, imaginary).",
-            requires=("channel",),
         )
     ]
     frequency = np.asarray(data["subcarrier_frequency"], dtype=float)
@@ -106,7 +100,7 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
     def offset(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
         distance = jnp.abs(jnp.asarray(context["subcarrier_frequency"]))
         centre = on_axis(distance == jnp.min(distance), "subcarrier", CHANNEL_AXES)
-        return jnp.where(centre, leak(value, p, context), value)
+        return value + jnp.where(centre, level * complex_of(p["leak"]), 0.0)
 
     centre = Effect(
         "crosstalk",
@@ -115,7 +109,7 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
         instance="carrier",
         physics="Leaking local oscillator: a complex number is added to the subcarrier at the carrier.",
         source="h_0 + g sqrt(P), g complex (real, imaginary).",
-        requires=("channel", "subcarrier_frequency"),
+        requires=("subcarrier_frequency",),
     )
     return [*effects, centre]
 
