@@ -25,7 +25,10 @@ def test_fit_by_name_and_by_engine():
 
 
 def test_names_are_those_of_the_table():
-    assert set(ENGINES) == {"nuts", "blackjax_nuts", "von_mises_em", "laplace", "point"}
+    assert set(ENGINES) == {
+        *("auto", "exact", "nuts", "blackjax_nuts", "smc", "svi"),
+        *("von_mises_em", "laplace", "ensemble", "point"),
+    }
     for name in ENGINES:
         engine = resolve(name)
         assert isinstance(engine, AbstractEngine)
