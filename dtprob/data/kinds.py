@@ -68,9 +68,27 @@ class _Checked:
         return {name: value for name, value in given.items() if value is not None}
 
 
+class _OfLinks(_Checked):
+    """Data with a row per link in some of the arrays."""
+
+    def take(self, links: Int[np.ndarray, " chosen"]) -> Self:
+        """The data of some links, in the order given.
+
+        Args:
+            links: indices of links.
+        """
+        specs = {**CHANNEL_ARRAYS, **POWER_ARRAYS}
+        rows = {
+            name: array[links]
+            for name, array in self.arrays().items()
+            if any(shape[:1] == ("link",) and len(shape) == np.ndim(array) for shape in specs[name].shapes)
+        }
+        return replace(self, **rows)  # pyright: ignore[reportArgumentType, reportReturnType]
+
+
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
-class ChannelData(_Checked):
+class ChannelData(_OfLinks):
     """Measured or simulated channel frequency responses.
 
     Attributes:
@@ -101,25 +119,10 @@ class ChannelData(_Checked):
         _check_array(self.rx_array, "rx_array", self.channel.shape[2])
         _check_array(self.tx_array, "tx_array", self.channel.shape[3])
 
-    def take(self, links: Int[np.ndarray, " chosen"]) -> Self:
-        """The data of some links, in the order given.
-
-        Args:
-            links: indices of links.
-        """
-        noise = self.noise_power
-        return replace(
-            self,
-            channel=self.channel[links],
-            rx_position=self.rx_position[links],
-            tx_position=self.tx_position[links],
-            noise_power=noise[links] if noise is not None and np.ndim(noise) else noise,
-        )
-
 
 @final
 @dataclass(frozen=True, eq=False, kw_only=True)
-class PowerData(_Checked):
+class PowerData(_OfLinks):
     """Received powers without phase: RSRP, coverage maps, beam sweeps.
 
     Attributes:
@@ -141,21 +144,6 @@ class PowerData(_Checked):
 
     def __post_init__(self) -> None:
         self._check(POWER_ARRAYS)
-
-    def take(self, links: Int[np.ndarray, " chosen"]) -> Self:
-        """The data of some links, in the order given.
-
-        Args:
-            links: indices of links.
-        """
-        noise = self.noise_power
-        return replace(
-            self,
-            power=self.power[links],
-            rx_position=self.rx_position[links],
-            tx_position=self.tx_position[links],
-            noise_power=noise[links] if noise is not None and np.ndim(noise) else noise,
-        )
 
 
 @final
