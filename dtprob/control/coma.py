@@ -10,8 +10,8 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dtprob.control.critic import CentralCritic
-from dtprob.control.policy import Memory, log_chance, unroll
-from dtprob.control.returns import counterfactual_advantage, lambda_returns
+from dtprob.control.policy import Memory, choice_entropy, log_chance, unroll_each
+from dtprob.control.returns import counterfactual_advantage, device_returns
 from dtprob.control.rollout import Trajectory
 
 
@@ -91,10 +91,8 @@ class COMA:
     ) -> tuple[Float[Array, "slot environment device"], Bool[Array, "slot environment"]]:
         """TD(lambda) returns of the actions taken, by device's critic, and where they are more than a guess."""
         value = taken(values(target, trajectory), trajectory.action)
-        by_device = jax.vmap(lambda_returns, (None, 1, None, None, None), 1)
-        every = jax.vmap(by_device, (1, 1, 1, None, None), 1)
-        returns = every(trajectory.reward / self.scale, value, trajectory.truncated, self.discount, self.mix)
-        return returns, ~trajectory.truncated.at[-1].set(True)
+        reward = trajectory.reward / self.scale
+        return device_returns(reward, value, trajectory.truncated, self.discount, self.mix)
 
     def advantage(
         self, critic: CentralCritic, trajectory: Trajectory
@@ -142,11 +140,7 @@ def actor_loss(
     entropy: Float[Array, ""],
 ) -> Float[Array, ""]:
     """Minus the weighted log-probability of the actions taken, and minus the entropy; an empty buffer has no say."""
-    logit = jax.vmap(unroll, (None, 0, 1, 1), (0, 1))(
-        policy, memory, trajectory.observation, trajectory.start
-    )[1]
+    logit = unroll_each(policy, memory, trajectory.observation, trajectory.start)
     matters = (trajectory.observation.buffer > 0) * counts[..., None]
     gain = log_chance(logit, trajectory.action) * advantage
-    chance = jax.nn.sigmoid(logit)
-    spread = -chance * jax.nn.log_sigmoid(logit) - (1 - chance) * jax.nn.log_sigmoid(-logit)
-    return -jnp.mean(matters * (gain + entropy * spread))
+    return -jnp.mean(matters * (gain + entropy * choice_entropy(logit)))

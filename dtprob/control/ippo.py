@@ -7,11 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from dtprob.control.critic import LocalCritic
-from dtprob.control.policy import Memory, log_chance, unroll
-from dtprob.control.returns import lambda_returns
+from dtprob.control.policy import Memory, choice_entropy, log_chance, unroll_each
+from dtprob.control.returns import device_returns
 from dtprob.control.rollout import Trajectory
 
 
@@ -59,9 +59,8 @@ class IPPO:
     ) -> tuple[Any, Kept, dict[str, Float[Array, ""]]]:
         """See `Learner`."""
         value = jax.vmap(jax.vmap(kept.critic))(trajectory.observation)
-        by_device = jax.vmap(lambda_returns, (None, 1, None, None, None), 1)
-        every = jax.vmap(by_device, (1, 1, 1, None, None), 1)
-        returns = every(trajectory.reward / self.scale, value, trajectory.truncated, self.discount, self.mix)
+        reward = trajectory.reward / self.scale
+        returns, counts = device_returns(reward, value, trajectory.truncated, self.discount, self.mix)
         advantage = returns - value
         advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
         entropy = self.entropy * jnp.maximum(0.0, 1 - 1.5 * progress)
@@ -70,7 +69,7 @@ class IPPO:
         def one(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], Array]:
             modules = eqx.combine(carry[0], fixed)
             error, slope = eqx.filter_value_and_grad(self.loss)(
-                modules, memory, trajectory, advantage, returns=returns, entropy=entropy
+                modules, memory, trajectory, advantage, returns=returns, counts=counts, entropy=entropy
             )
             change, state = self._optimiser().update(slope, carry[1])
             modules = eqx.apply_updates(modules, jax.tree.map(lambda x: -rate * x, change))
@@ -89,24 +88,20 @@ class IPPO:
         advantage: Float[Array, "slot environment device"],
         *,
         returns: Float[Array, "slot environment device"],
+        counts: Bool[Array, "slot environment"],
         entropy: Float[Array, ""],
     ) -> Float[Array, ""]:
         """Clipped objective, error of the critic, entropy; an empty buffer has no say."""
         policy, critic = modules
-        counts = ~trajectory.truncated.at[-1].set(True)[..., None]
-        logit = jax.vmap(unroll, (None, 0, 1, 1), (0, 1))(
-            policy, memory, trajectory.observation, trajectory.start
-        )[1]
+        logit = unroll_each(policy, memory, trajectory.observation, trajectory.start)
         ratio = jnp.exp(
             log_chance(logit, trajectory.action) - log_chance(trajectory.logit, trajectory.action)
         )
         near = jnp.clip(ratio, 1 - self.clip, 1 + self.clip)
-        chance = jax.nn.sigmoid(logit)
-        spread = -chance * jax.nn.log_sigmoid(logit) - (1 - chance) * jax.nn.log_sigmoid(-logit)
-        gain = jnp.minimum(ratio * advantage, near * advantage) + entropy * spread
+        gain = jnp.minimum(ratio * advantage, near * advantage) + entropy * choice_entropy(logit)
         error = (jax.vmap(jax.vmap(critic))(trajectory.observation) - returns) ** 2
         matters = trajectory.observation.buffer > 0
-        return jnp.mean(counts * (0.5 * error - matters * gain))
+        return jnp.mean(counts[..., None] * (0.5 * error - matters * gain))
 
     def _optimiser(self) -> optax.GradientTransformation:
         return optax.flatten(optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam()))

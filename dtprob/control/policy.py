@@ -177,6 +177,22 @@ def unroll(
     return jax.lax.scan(one, memory, (observations, starts))
 
 
+def unroll_each(
+    policy: Policy,
+    memory: Memory,
+    observations: Observation,
+    starts: Bool[Array, "slot environment"],
+) -> Float[Array, "slot environment device"]:
+    """Log-odds over consecutive slots of every environment; see `unroll`."""
+    return jax.vmap(unroll, (None, 0, 1, 1), (0, 1))(policy, memory, observations, starts)[1]
+
+
+def choice_entropy(logit: Float[Array, "..."]) -> Float[Array, "..."]:
+    """Entropy, nats, of the choice to send or to be silent given the log-odds of sending."""
+    chance = jax.nn.sigmoid(logit)
+    return -chance * jax.nn.log_sigmoid(logit) - (1 - chance) * jax.nn.log_sigmoid(-logit)
+
+
 def log_chance(logit: Float[Array, "..."], action: Int[Array, "..."]) -> Float[Array, "..."]:
     """Log-probability of an action given the log-odds of sending."""
     return jax.nn.log_sigmoid(jnp.where(action > 0, logit, -logit))

@@ -38,6 +38,19 @@ def lambda_returns(
     return jax.lax.scan(one, start, (reward, value, ends), reverse=True)[1]
 
 
+def device_returns(
+    reward: Float[Array, "slot environment"],
+    value: Float[Array, "slot environment device"],
+    truncated: Bool[Array, "slot environment"],
+    discount: float,
+    mix: float,
+) -> tuple[Float[Array, "slot environment device"], Bool[Array, "slot environment"]]:
+    """`lambda_returns` of every device in every environment, and where they are more than a guess."""
+    by_device = jax.vmap(lambda_returns, (None, 1, None, None, None), 1)
+    every = jax.vmap(by_device, (1, 1, 1, None, None), 1)
+    return every(reward, value, truncated, discount, mix), ~truncated.at[-1].set(True)
+
+
 def counterfactual_advantage(
     value: Float[Array, "*batch choice"], logit: Float[Array, "*batch"], action: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
