@@ -27,16 +27,6 @@ class Progress:
     say: Callable[[str], None] = lambda _: None
     folder: Path | None = None
 
-    def kept(self, name: str, compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
-        """Arrays that several figures share, kept beside their results as ``name.npz``; computed when absent.
-
-        Args:
-            name: of the file, unique among what is kept.
-            compute: makes the arrays.
-        """
-        self.say(name)
-        return _stored(None if self.folder is None else self.folder.parent / f"{name}.npz", compute)
-
     def part(self, name: str, compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
         """The arrays of one part of a figure: those of an interrupted run if it got so far, else computed.
 
@@ -45,22 +35,18 @@ class Progress:
             compute: makes the arrays.
         """
         self.say(name)
-        digest = hashlib.sha256(name.encode()).hexdigest()[:16]
-        return _stored(None if self.folder is None else self.folder / f"{digest}.npz", compute)
+        if self.folder is None:
+            return dict(compute())
+        file = self.folder / f"{hashlib.sha256(name.encode()).hexdigest()[:16]}.npz"
+        if file.is_file():
+            with np.load(file, allow_pickle=False) as stored:
+                return {key: stored[key] for key in stored.files}
+        arrays = dict(compute())
+        with atomic_write(file) as path:
+            np.savez_compressed(path, allow_pickle=False, **arrays)
+        return arrays
 
     def done(self) -> None:
         """Forget the parts: the figure is written."""
         if self.folder is not None:
             shutil.rmtree(self.folder, ignore_errors=True)
-
-
-def _stored(file: Path | None, compute: Callable[[], Arrays]) -> dict[str, np.ndarray]:
-    if file is None:
-        return dict(compute())
-    if file.is_file():
-        with np.load(file, allow_pickle=False) as stored:
-            return {key: stored[key] for key in stored.files}
-    arrays = dict(compute())
-    with atomic_write(file) as path:
-        np.savez_compressed(path, allow_pickle=False, **arrays)
-    return arrays

@@ -173,16 +173,3 @@ def test_figure_10_states_gain_and_shortfall(paths):
     # A second antenna gives what a second antenna can, half of it at the least.
     one, two = (panel.series[5].median for panel in found.panels)
     assert np.all(np.abs(two - one - 0.75) < 0.25)
-
-
-def test_what_is_kept_is_computed_once(tmp_path):
-    progress, calls = Progress(folder=tmp_path / "parts"), []
-
-    def compute():
-        calls.append(1)
-        return {"a": np.arange(3)}
-
-    for _ in range(2):
-        np.testing.assert_array_equal(progress.kept("shared", compute)["a"], np.arange(3))
-    assert calls == [1]
-    assert (tmp_path / "shared.npz").is_file()
