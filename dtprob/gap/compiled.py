@@ -278,20 +278,22 @@ class Compiled:
             trace, _, _ = self._runner.run(x, arrays, {})
             error, signal = {}, {}
             for name, o in self._runner.observations(trace).items():
-                value, zero = trace[name]["value"], jnp.zeros(self._runner.shapes[name])
-                if "loc" not in o.parameters:
-                    error[name], signal[name] = zero, zero
-                    continue
-                is_log = o.family == "LogNormal"
-                miss = (
-                    _DECIBELS * (jnp.log(value) - o.parameters["loc"])
-                    if is_log
-                    else value - o.parameters["loc"]
-                )
-                error[name] = zero.at[0].set(o.masked(jnp.abs(miss) ** 2))
-                signal[name] = zero.at[0].set(
-                    o.masked(jnp.ones_like(miss) if is_log else jnp.abs(value) ** 2)
-                )
+                zero = jnp.zeros(self._runner.shapes[name])
+                squared, power = _squared_error(o, trace[name]["value"])
+                error[name], signal[name] = zero.at[0].set(squared), zero.at[0].set(power)
             return self._runner.rows.stack(error).sum(1), self._runner.rows.stack(signal).sum(1)
 
         return lambda x: prediction_error(jnp.asarray(x), self._arrays)
+
+
+def _squared_error(
+    observation: whiten.Observation, value: jax.Array
+) -> tuple[jax.Array | float, jax.Array | float]:
+    """Squared error and squared signal of an observation by entry; none where it has no location."""
+    if "loc" not in observation.parameters:
+        return 0.0, 0.0
+    loc = observation.parameters["loc"]
+    if observation.family == "LogNormal":
+        error = _DECIBELS * (jnp.log(value) - loc)
+        return observation.masked(error**2), observation.masked(jnp.ones_like(error))
+    return observation.masked(jnp.abs(value - loc) ** 2), observation.masked(jnp.abs(value) ** 2)

@@ -164,9 +164,8 @@ def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
     nuisances = []
     for name in (n for n in problem.declaration.latent if n in names):
         values = np.stack(draws[name])
-        for j in np.flatnonzero(
-            np.isfinite(values).all(axis=0)
-        ):  # what cannot happen has log-probability -inf
+        possible = np.isfinite(values).all(axis=0)  # what cannot happen has log-probability -inf
+        for j in np.flatnonzero(possible):
             low, high = np.quantile(values[:, j], [0.05, 0.95])
             label = name if values.shape[1] == 1 else f"{name}[{j}]"
             nuisances.append(

@@ -158,66 +158,82 @@ def interferer(sites: Sites, _data: Data) -> list[Effect]:
 
 def ack_loss(sites: Sites, _data: Data) -> list[Effect]:
     """Deliveries of a device are not acknowledged."""
-    if not offers(sites, "reception_logits", "device_advantage"):
-        return []
-    devices = sites["device_advantage"].shape[-1]
-    effects: list[Effect] = []
-    for device in range(devices):
 
-        def other(value: Any, context: Mapping[str, Any], device: int = device) -> Any:
-            p, senders = jax.nn.softmax(value), jnp.maximum(_senders(context), 1)
-            share = np.arange(p.shape[-1]) / senders[..., None]
-            law = p * jnp.maximum(1.0 - share, 0.0) + _next(p * share)
-            return jnp.where(_with(context, device), law, p)
+    def other(value: Any, context: Mapping[str, Any], device: int) -> Any:
+        p, senders = jax.nn.softmax(value), jnp.maximum(_senders(context), 1)
+        share = np.arange(p.shape[-1]) / senders[..., None]
+        law = p * jnp.maximum(1.0 - share, 0.0) + _next(p * share)
+        return jnp.where(_with(context, device), law, p)
 
-        effects.append(
-            Effect(
-                "ack_loss",
-                {
-                    "reception_logits": _mixed(other, "loss"),
-                    "device_advantage": lambda value, p, _, device=device: (
-                        value - p["loss"] * at(device, devices)
-                    ),
-                },
-                (half_normal("loss", 0.5),),
-                instance=f"device_{device}",
-                physics=f"A delivery of device {device} goes unacknowledged with probability 1 - exp(-loss).",
-                source="Thinning of the deliveries; exact for one delivery per slot.",
-                requires=("sending",),
-            )
-        )
-    return effects
+    return _unheard(
+        sites,
+        "ack_loss",
+        "loss",
+        other,
+        physics="A delivery of device {device} goes unacknowledged with probability 1 - exp(-loss).",
+        source="Thinning of the deliveries; exact for one delivery per slot.",
+        requires=("sending",),
+    )
 
 
 def duty_cycle(sites: Sites, _data: Data) -> list[Effect]:
     """A device's radio sleeps in part of the slots in which it is to send."""
+
+    def other(value: Any, context: Mapping[str, Any], device: int) -> Any:
+        law = jnp.exp(context["log_reception"])[jnp.maximum(_senders(context) - 1, 0)]
+        return jnp.where(_with(context, device), law, jax.nn.softmax(value))
+
+    return _unheard(
+        sites,
+        "duty_cycle",
+        "sleep",
+        other,
+        physics="Device {device} does not transmit in a share 1 - exp(-sleep) of the slots in which it is to.",
+        source="P_s becomes P_{s-1}; who is delivered to first order in the share.",
+        requires=("sending", "log_reception"),
+    )
+
+
+def _unheard(
+    sites: Sites,
+    family: str,
+    parameter: str,
+    other: Callable[[Any, Mapping[str, Any], int], Any],
+    *,
+    physics: str,
+    source: str,
+    requires: tuple[str, ...],
+) -> list[Effect]:
+    """A part of what a device sends is not heard: another law of deliveries in that part, and fewer are its own.
+
+    Args:
+        sites: what the model offers.
+        family: of the effects, one per device.
+        parameter: its share of slots is 1 - exp(-parameter).
+        other: (logits, context, device) -> probabilities of the number of deliveries in those slots.
+        physics: with {device} where the device's number belongs.
+        source: of the formula.
+        requires: sites that `other` reads.
+    """
     if not offers(sites, "reception_logits", "device_advantage"):
         return []
     devices = sites["device_advantage"].shape[-1]
-    effects: list[Effect] = []
-    for device in range(devices):
 
-        def other(value: Any, context: Mapping[str, Any], device: int = device) -> Any:
-            law = jnp.exp(context["log_reception"])[jnp.maximum(_senders(context) - 1, 0)]
-            return jnp.where(_with(context, device), law, jax.nn.softmax(value))
-
-        effects.append(
-            Effect(
-                "duty_cycle",
-                {
-                    "reception_logits": _mixed(other, "sleep"),
-                    "device_advantage": lambda value, p, _, device=device: (
-                        value - p["sleep"] * at(device, devices)
-                    ),
-                },
-                (half_normal("sleep", 0.5),),
-                instance=f"device_{device}",
-                physics=f"Device {device} does not transmit in a share 1 - exp(-sleep) of the slots in which it is to.",
-                source="P_s becomes P_{s-1}; who is delivered to first order in the share.",
-                requires=("sending", "log_reception"),
-            )
+    def of(device: int) -> Effect:
+        return Effect(
+            family,
+            {
+                "reception_logits": _mixed(lambda value, context: other(value, context, device), parameter),
+                "device_advantage": lambda value, p, _: value - p[parameter] * at(device, devices),
+            },
+            (half_normal(parameter, 0.5),),
+            instance=f"device_{device}",
+            physics=physics.format(device=device),
+            source=source,
+            requires=requires,
         )
-    return effects
+
+    return [of(device) for device in range(devices)]
 
 
 def _mixed(other: Other, parameter: str) -> Callable[[Any, Mapping[str, Any], Mapping[str, Any]], Any]:
