@@ -86,13 +86,13 @@ def coefficients(
         cosine: their direction cosines along the line.
         elements: of the line.
     """
-    total = power.sum(axis=1, keepdims=True)
-    weight = power / np.where(total > 0, total, 1.0)
-    turn = np.exp(1j * np.pi * cosine)
+    total = power.sum(axis=1)
+    weight = power.T / np.where(total > 0, total, 1.0)
+    turn = np.exp(1j * np.pi * np.ascontiguousarray(cosine.T))
     found = np.empty((elements - 1, len(power)), complex)
     for degree in range(elements - 1):
         weight = weight * turn
-        found[degree] = weight.sum(axis=1)
+        found[degree] = weight.sum(axis=0)
     found *= _scale(elements)[:, None]
     return np.concatenate([np.real(found), np.imag(found)]).T
 

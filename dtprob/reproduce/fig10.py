@@ -8,11 +8,11 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
-from scipy import stats
 
 from dtprob.models.prediction_powered.schemes import SCHEMES
 from dtprob.reproduce import beam_alignment
 from dtprob.reproduce.beam_alignment import RATE, Campaign, Case
+from dtprob.reproduce.beam_findings import gain, standing
 from dtprob.reproduce.beams_codebook import Arrays
 from dtprob.reproduce.beams_file import read_paths
 from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
@@ -22,7 +22,6 @@ RUNS: Final = beam_alignment.RUNS
 ROWS: Final = 20
 LABELLED: Final = (100, 200, 300, 500, 1000, 2000, 3000)
 _STATED: Final = 300
-_LEVEL: Final = 0.9
 
 
 def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
@@ -54,22 +53,8 @@ def drawn(name: str, campaign: Campaign, cases: Mapping[str, Case], labelled: Se
 
 
 def _findings(table: Float[np.ndarray, "run scheme 2 point"], labelled: Sequence[int]) -> list[str]:
-    """Lambda, the gain over ERM and the largest shortfall against the best other scheme."""
-    names = list(SCHEMES)
-    tuned = names.index("tuned_cppi")
-    lam = table[:, tuned, 1].mean(axis=0)
+    """Lambda, the gain over ERM, and where the tuned scheme is not the best."""
+    rate, lam = table[:, :, 0], table[:, list(SCHEMES).index("tuned_cppi"), 1].mean(axis=0)
     shown = ", ".join(f"{value:.2f} at {n}" for n, value in zip(labelled, lam, strict=True))
-    found = [f"mean lambda of tuned_cppi {shown}"]
-    at = labelled.index(_STATED) if _STATED in labelled else 0
-    gain = table[:, tuned, 0, at] - table[:, names.index("erm"), 0, at]
-    if len(gain) > 1:
-        half = stats.t.ppf((1 + _LEVEL) / 2, len(gain) - 1) * gain.std(ddof=1) / np.sqrt(len(gain))
-        interval = f"90% interval {gain.mean() - half:.3f} to {gain.mean() + half:.3f}"
-        found.append(f"mean gain over erm at {labelled[at]}: {gain.mean():.3f} bit/s/Hz, {interval}")
-    rate = np.median(table[:, :, 0], axis=0)
-    others = np.delete(rate, tuned, axis=0)
-    short = others.max(axis=0) - rate[tuned]
-    worst = int(np.argmax(short))
-    best = np.delete(np.array(names), tuned)[others[:, worst].argmax()]
-    text = f"median of tuned_cppi minus that of the best other: least {-short[worst]:.3f} bit/s/Hz"
-    return [*found, f"{text}, at {labelled[worst]} ({best})"]
+    at = _STATED if _STATED in labelled else labelled[0]
+    return [f"mean lambda of tuned_cppi {shown}", gain(rate, labelled, at), standing(rate, labelled)]

@@ -7,6 +7,7 @@ import pytest
 from dtprob.models.prediction_powered.schemes import SCHEMES
 from dtprob.reproduce import beam_alignment, fig9, fig10, fig10_learned
 from dtprob.reproduce.beam_alignment import Campaign, Case
+from dtprob.reproduce.beam_findings import gain, standing
 from dtprob.reproduce.beam_maps import MAPS, interpolated
 from dtprob.reproduce.beams import BeamPaths, Site
 from dtprob.reproduce.beams_codebook import (
@@ -173,3 +174,15 @@ def test_figure_10_states_gain_and_shortfall(paths):
     # A second antenna gives what a second antenna can, half of it at the least.
     one, two = (panel.series[5].median for panel in found.panels)
     assert np.all(np.abs(two - one - 0.75) < 0.25)
+
+
+def test_findings_tell_where_the_tuned_scheme_is_not_the_best():
+    rate = np.arange(5.0)[:, None, None] * np.ones((len(SCHEMES), 2))
+    tuned = list(SCHEMES).index("tuned_cppi")
+    rate[:, tuned] += [0.5, -1.25]
+    assert gain(rate, [30, 60], 30) == "mean gain over erm at 30: 0.500 bit/s/Hz, 90% interval 0.500 to 0.500"
+    text = standing(rate, [30, 60])
+    assert "the highest at 1 of 2 points, the best other at or below its upper quartile at 1;" in text
+    assert "worst at 60: 1.250 bit/s/Hz below erm, with quartiles -0.250 and 1.750 around 0.750" in text
+    assert "mean difference -1.250 bit/s/Hz" in text
+    assert standing(rate[..., :1], [30]) == "median of tuned_cppi the highest at 1 of 1 points"
