@@ -33,7 +33,7 @@ def record(
         faults: each with its size; they act in this order.
     """
     uniform = np.random.default_rng(list(seed)).random((slots, network.devices + len(network.clusters) + 2))
-    sets, sound = subsets(network.devices), _sound_acks(network)
+    sets, sound = subsets(network.devices), sound_acks(network)
     place = 2 ** np.arange(network.devices)[::-1]
     buffer, arrival = np.zeros(network.devices, int), np.zeros(network.devices, int)
     memories = [fault.start(size) for fault, size in faults]
@@ -81,8 +81,8 @@ def _laws(
     return rows, acks
 
 
-def _sound_acks(network: Network) -> Acks:
-    """Each set of the right size among the senders is as likely as any other."""
+def sound_acks(network: Network) -> Acks:
+    """Chances of the sets that are acknowledged: each set of the right size among the senders is as likely as any other."""
     sets = subsets(network.devices)
     sizes = sets.sum(axis=1)
     inside = np.all(sets[None] <= sets[:, None], axis=2)

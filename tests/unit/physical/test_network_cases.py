@@ -11,7 +11,7 @@ from dtprob.errors import InputError
 from dtprob.physical.multi_access.cases import generate_cases
 from dtprob.physical.multi_access.fault import Past, subsets
 from dtprob.physical.multi_access.faults import FAMILIES, FOREIGN, LISTED, draw
-from dtprob.physical.multi_access.log import record
+from dtprob.physical.multi_access.log import record, sound_acks
 from dtprob.physical.multi_access.network import Network, reception
 
 NETWORK = Network(
@@ -23,9 +23,7 @@ NETWORK = Network(
 
 
 def laws(fault, size, past):
-    from dtprob.physical.multi_access.log import _sound_acks
-
-    rows, acks = NETWORK.arrival[:, 0], _sound_acks(NETWORK)
+    rows, acks = NETWORK.arrival[:, 0], sound_acks(NETWORK)
     rows = fault.arrivals(rows, past, size) if fault.arrivals else rows
     return rows, fault.acks(acks, past, size) if fault.acks else acks
 
