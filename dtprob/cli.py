@@ -103,7 +103,9 @@ def _add_case(added: argparse.ArgumentParser) -> None:
 def _add_withheld(added: argparse.ArgumentParser) -> None:
     parts = added.add_subparsers(metavar="STEP", dest="step", required=True)
     generate = parts.add_parser("generate", help="make cases/NNNN/ and, apart from them, key.json")
-    generate.add_argument("--track", required=True, metavar="TRACK", help="kind of twin: channel or network")
+    generate.add_argument(
+        "--track", required=True, metavar="TRACK", help="kind of twin: channel, network or labels"
+    )
     generate.add_argument("--count", type=int, required=True, metavar="N", help="number of cases")
     generate.add_argument("--seed", type=int, default=0, metavar="S", help="where randomness starts")
     _add_out(generate)

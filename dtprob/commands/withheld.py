@@ -14,7 +14,11 @@ from dtprob.commands.progress import Say, telling
 from dtprob.errors import InputError, unknown_name
 from dtprob.files import atomic_write
 
-TRACKS: Final = {"channel": "dtprob.physical.cases", "network": "dtprob.physical.multi_access.cases"}
+TRACKS: Final = {
+    "channel": "dtprob.physical.cases",
+    "network": "dtprob.physical.multi_access.cases",
+    "labels": "dtprob.physical.labels_cases",
+}
 """For each track, the module whose `generate_cases` writes its cases and their key."""
 
 _SHARED: Final = 4

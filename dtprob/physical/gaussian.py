@@ -1,0 +1,182 @@
+"""Gaussian measurements in independent blocks, faults that change their law, and how much a fault can be told by.
+
+The base twin's law has a mean that is linear in free coefficients and a covariance with a few free parameters; both are
+fitted, so that what they can imitate does not count.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+from scipy import optimize
+
+from dtprob.physical.information import size_for
+
+type Vector = Float[np.ndarray, "block row"]
+type Covariance = Float[np.ndarray, "block row row"]
+type Tangents = Float[np.ndarray, "block row coefficient"]
+
+_TOLERANCE: Final = 0.15
+"""Relative error of lambda that counts as met."""
+_WIDEST: Final = 6.0
+"""How far the logarithms of the covariance's parameters may move."""
+
+
+@dataclass(frozen=True)
+class Law:
+    """The law of all measurements, normal in each block.
+
+    Attributes:
+        mean: of each row.
+        covariance: of each block.
+    """
+
+    mean: Vector
+    covariance: Covariance
+
+
+@dataclass(frozen=True)
+class Bench:
+    """A sound law, and what the base twin can fit.
+
+    Attributes:
+        law: of the measurements without a fault.
+        tangents: by which the twin's mean moves with each free coefficient.
+        family: covariance at the logarithms of its free parameters.
+        start: these logarithms where `family` gives the sound law's covariance.
+    """
+
+    law: Law
+    tangents: Tangents
+    family: Callable[[np.ndarray], Covariance]
+    start: np.ndarray
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One fault of a Gaussian measurement; of size 0 it changes nothing.
+
+    Attributes:
+        family: name of the physics.
+        instance: which place, site or part; None where there is only one.
+        unit: of the size.
+        limit: largest size.
+        change: (law, size) -> law.
+        detail: what else the key tells of it.
+    """
+
+    family: str
+    instance: str | None
+    unit: str
+    limit: float
+    change: Callable[[Law, float], Law]
+    detail: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """`family` or `family[instance]`."""
+        return self.family if self.instance is None else f"{self.family}[{self.instance}]"
+
+
+@dataclass(frozen=True)
+class Sized:
+    """A fault in a case: how large, and its information alone."""
+
+    fault: Fault
+    size: float
+    lambda_: float
+
+    def record(self) -> dict[str, Any]:
+        """For the key."""
+        fault = self.fault
+        return {
+            "name": fault.name,
+            "family": fault.family,
+            "instance": fault.instance,
+            "size": self.size,
+            "unit": fault.unit,
+            "lambda": self.lambda_,
+            "detail": dict(fault.detail),
+        }
+
+
+def shifted(shape: Vector) -> Callable[[Law, float], Law]:
+    """A change that adds `shape` times the size to the mean."""
+    return lambda law, size: replace(law, mean=law.mean + size * shape)
+
+
+def louder(shape: Vector) -> Callable[[Law, float], Law]:
+    """A change that multiplies the standard deviation of every row by exp(shape times the size)."""
+
+    def change(law: Law, size: float) -> Law:
+        factor = np.exp(size * shape)
+        return replace(law, covariance=law.covariance * factor[:, :, None] * factor[:, None, :])
+
+    return change
+
+
+def information(bench: Bench, law: Law) -> float:
+    """Twice the divergence of a law from the nearest one that the twin can fit.
+
+    Args:
+        bench: the sound law and the twin's freedom.
+        law: the one with a fault.
+    """
+    entropy = float(np.linalg.slogdet(law.covariance)[1].sum())
+    difference = law.mean - bench.law.mean
+
+    def twice(logarithms: np.ndarray) -> float:
+        covariance = bench.family(logarithms)
+        inverse = np.linalg.inv(covariance)
+        left = _remaining(difference, bench.tangents, inverse)
+        spread = np.einsum("bij,bji->", inverse, law.covariance)
+        fit = np.einsum("bi,bij,bj->", left, inverse, left)
+        return float(np.linalg.slogdet(covariance)[1].sum() - entropy + spread + fit - difference.size)
+
+    near = [(value - _WIDEST, value + _WIDEST) for value in bench.start]
+    found = optimize.minimize(twice, bench.start, method="L-BFGS-B", bounds=near)
+    return max(0.0, min(float(found.fun), twice(bench.start)))
+
+
+def visible(bench: Bench, law: Law) -> Vector:
+    """What a fault changes of the mean beyond what the twin's coefficients imitate, in standard deviations."""
+    inverse = np.linalg.inv(bench.law.covariance)
+    left = _remaining(law.mean - bench.law.mean, bench.tangents, inverse)
+    return np.einsum("bij,bi->bj", np.linalg.cholesky(inverse), left)
+
+
+def sized(bench: Bench, fault: Fault, target: float) -> Sized | None:
+    """A fault of the size at which its information is `target`; None where no size gives that.
+
+    Args:
+        bench: the sound law and the twin's freedom.
+        fault: which.
+        target: lambda.
+
+    Raises:
+        InputError: the fault at its limit is not that informative.
+    """
+    size, found = size_for(
+        target, lambda size: information(bench, fault.change(bench.law, size)), limit=fault.limit
+    )
+    return Sized(fault, size, found) if abs(found / target - 1) <= _TOLERANCE else None
+
+
+def measure(rng: np.random.Generator, law: Law) -> Vector:
+    """One draw of all measurements."""
+    root = np.linalg.cholesky(law.covariance)
+    return law.mean + np.einsum("bij,bj->bi", root, rng.standard_normal(law.mean.shape))
+
+
+def _remaining(difference: Vector, tangents: Tangents, inverse: Covariance) -> Vector:
+    """A change of the mean after generalised least squares on the tangents."""
+    if not tangents.shape[2]:
+        return difference
+    weighted = np.einsum("bij,bjk->bik", inverse, tangents)
+    gram = np.einsum("bik,bil->kl", tangents, weighted)
+    coefficients = np.linalg.lstsq(gram, np.einsum("bik,bi->k", weighted, difference), rcond=None)[0]
+    return difference - tangents @ coefficients
