@@ -1,19 +1,21 @@
-"""Simulation-based calibration of the engines on small models, at full size.
+"""Simulation-based calibration of the engines, at full size.
 
-    python benchmarks/calibration.py [--engine NAME ...] [--case NAME ...] [--runs 300] [--write]
+    python benchmarks/calibration.py [--engine NAME ...] [--case NAME ...] [--runs 300] [--seconds 600] [--write]
 
 For each engine and model: values are drawn from the prior, data from them, and the true value is ranked among
 19 draws of the posterior of these data. An exact engine gives even ranks and 90% intervals that hold the true value
-nine times in ten; of the others the table tells how far they are from that. --write adds the rows to
-benchmarks/results/calibration.json.
+nine times in ten; of the others the table tells how far they are from that. The prediction-powered loss has no law
+of its data: there the data come from a population whose parameters are known.
+
+--write keeps how often each rank occurred in benchmarks/results/calibration.json, and a later call goes on from there;
+--seconds ends a call after so long, --table prints the table of what is there.
 """
 
 import argparse
 import datetime as dt
+import itertools
 import json
 import platform
-import shlex
-import sys
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -24,84 +26,126 @@ from dtprob.xla import avoid_miscompilation
 avoid_miscompilation()  # before jax is imported
 
 import jax  # noqa: E402
+import numpy as np  # noqa: E402
 
 from dtprob.errors import InputError  # noqa: E402
 from dtprob.inference import resolve  # noqa: E402
-from dtprob.testing.calibration import CASES, DRAWS, judge, simulated_ranks  # noqa: E402
+from dtprob.testing.calibration import DRAWS, judge, simulated_ranks  # noqa: E402
+from dtprob.testing.calibration_cases import CASES  # noqa: E402
 
 FILE = Path(__file__).parent / "results" / "calibration.json"
+BLOCK = 20
 CHAIN = {"warmup": 300, "draws": 10 * DRAWS, "chains": 1}
 SETTINGS: dict[str, dict[str, Any]] = {
+    "exact": {"draws": DRAWS},
+    "laplace": {"draws": DRAWS},
+    "von_mises_em": {"draws": DRAWS},
+    "ensemble": {"members": DRAWS},
     "nuts": CHAIN,
     "blackjax_nuts": CHAIN,
-    "smc": {"draws": 20 * DRAWS, "chains": 1},
     "svi": {"draws": DRAWS},
-    "laplace": {"draws": DRAWS},
-    "ensemble": {"members": DRAWS},
-    "exact": {"draws": DRAWS},
+    "smc": {"draws": 20 * DRAWS, "chains": 1},
 }
+MODELS = ("multi_access", "phase_error_channel", "prediction_powered", "custom")
+
+type Counts = dict[str, dict[str, dict[str, list[int]]]]
 
 
 def main() -> None:
     """Run the calibration and print its table."""
     options = arguments()
     jax.config.update("jax_enable_x64", True)
-    rows: list[dict[str, Any]] = []
-    for engine in options.engine:
-        for case in options.case:
-            rows += calibrated(engine, case, options.runs)
-    if options.write:
-        write(rows)
+    end = time.monotonic() + options.seconds
+    kept = json.loads(FILE.read_text()) if FILE.is_file() else {}
+    counts: Counts = kept.get("counts", {}) if options.write or options.table else {}
+    refused: dict[str, dict[str, str]] = kept.get("refused", {})
+    for engine, case in () if options.table else itertools.product(options.engine, options.case):
+        if case in refused.get(engine, {}) or time.monotonic() > end:
+            continue
+        try:
+            continued(counts.setdefault(engine, {}).setdefault(case, {}), engine, case, options.runs, end)
+        except InputError as error:
+            refused.setdefault(engine, {})[case] = str(error)
+        if options.write:
+            write({name: found for name, found in counts.items() if any(found.values())}, refused)
+    table(counts)
 
 
 def arguments() -> argparse.Namespace:
     """Which engines and models, and how many data sets."""
     parser = argparse.ArgumentParser(description="Simulation-based calibration of the engines.")
     parser.add_argument("--engine", nargs="+", choices=SETTINGS, default=list(SETTINGS))
-    parser.add_argument("--case", nargs="+", choices=CASES, default=list(CASES))
+    parser.add_argument("--case", nargs="+", choices=CASES, default=list(MODELS))
     parser.add_argument("--runs", type=int, default=300)
+    parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--write", action="store_true")
+    parser.add_argument("--table", action="store_true")
     return parser.parse_args()
 
 
-def calibrated(engine: str, case: str, runs: int) -> list[dict[str, Any]]:
-    """A row for each entry of each site; none where the engine does not serve the model."""
+def continued(counts: dict[str, list[int]], engine: str, case: str, runs: int, end: float) -> None:
+    """Go on from the data sets that are counted already, in blocks, while there is time."""
     begin = time.process_time()
-    try:
-        ranks = simulated_ranks(resolve(engine, **SETTINGS[engine]), CASES[case], jax.random.key(11), runs)
-    except InputError as error:
-        print(f"{engine:14s} {case:13s} refused: {error}")
-        return []
+    done = first = sum(next(iter(counts.values()), []))
+    made = CASES[case]()
+    while done < runs and time.monotonic() < end:
+        block = range(done, min(done + BLOCK, runs))
+        found = simulated_ranks(resolve(engine, **SETTINGS[engine]), made, jax.random.key(11), block)
+        for site, ranks in found.items():
+            before = np.asarray(counts.get(site, [0] * (DRAWS + 1)))
+            counts[site] = (before + np.bincount(ranks, minlength=DRAWS + 1)).tolist()
+        done = block.stop
     seconds = time.process_time() - begin
-    rows: list[dict[str, Any]] = []
-    for site, found in ranks.items():
-        verdict = judge(found)
-        print(
-            f"{engine:14s} {case:13s} {site:10s} uneven p {verdict.p_value:.4f}   90% intervals hold "
-            f"{verdict.coverage:.3f} (p {verdict.coverage_p_value:.4f})   mean rank {verdict.mean:.3f}",
-            flush=True,
-        )
-        facts = {name: round(value, 5) for name, value in verdict._asdict().items()}
-        rows.append({"engine": engine, "case": case, "site": site, "runs": runs, **facts})
-    print(f"{engine:14s} {case:13s} {seconds:.0f} s of processor time")
-    return rows
+    print(
+        f"{engine:14s} {case:20s} {first} to {done} data sets, {seconds:.0f} s of processor time", flush=True
+    )
 
 
-def write(rows: list[dict[str, Any]]) -> None:
-    """Put the rows in place of older ones of the same engine and case."""
-    old = json.loads(FILE.read_text())["rows"] if FILE.is_file() else []
-    done = {(row["engine"], row["case"]) for row in rows}
-    kept = [row for row in old if (row["engine"], row["case"]) not in done]
+def table(counts: Counts) -> None:
+    """A line per engine and model: coverage, least and most over unknowns, and p-values for all of them together."""
+    for engine, cases in counts.items():
+        for case, sites in cases.items():
+            if not sites:
+                continue
+            verdicts = {name: judge(np.repeat(np.arange(DRAWS + 1), c)) for name, c in sites.items()}
+            coverage = {name: verdict.coverage for name, verdict in verdicts.items()}
+            low, high = min(coverage, key=coverage.__getitem__), max(coverage, key=coverage.__getitem__)
+            uneven, misses = (
+                min(1.0, len(verdicts) * min(getattr(v, name) for v in verdicts.values()))
+                for name in ("p_value", "coverage_p_value")
+            )
+            runs = sum(next(iter(sites.values())))
+            print(
+                f"| `{engine}` | {case} | {runs} | {coverage[low]:.2f} (`{low}`) to {coverage[high]:.2f} "
+                f"| {_p(misses)} | {_p(uneven)} |"
+            )
+
+
+def _p(value: float) -> str:
+    return f"{value:.3f}" if value >= 0.001 else "< .001"
+
+
+def write(counts: Counts, refused: dict[str, dict[str, str]]) -> None:
+    """Keep the counts with what it takes to repeat them."""
     result = {
-        "benchmark": "simulation-based calibration: ranks of true values among 19 draws",
-        "command": shlex.join(["python", "benchmarks/calibration.py", *sys.argv[1:]]),
+        "benchmark": "simulation-based calibration: how often each rank of the true value among 19 draws occurred",
+        "command": "python benchmarks/calibration.py --write",
         "date": dt.datetime.now(dt.UTC).date().isoformat(),
         "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
         "versions": {name: version(name) for name in ("jax", "numpyro", "blackjax")},
-        "rows": kept + rows,
+        "settings": SETTINGS,
+        "refused": refused,
+        "counts": counts,
     }
-    FILE.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {FILE.relative_to(Path.cwd()) if FILE.is_relative_to(Path.cwd()) else FILE}")
+    text = json.dumps(result, indent=1)
+    FILE.write_text(_short_lists(text) + "\n")
+
+
+def _short_lists(text: str) -> str:
+    """The JSON with each list of numbers on one line."""
+    parts = text.split("[")
+    lists = [part.split("]", 1) for part in parts[1:]]
+    return parts[0] + "".join(f"[{' '.join(inside.split())}]{rest}" for inside, rest in lists)
 
 
 if __name__ == "__main__":

@@ -7,14 +7,12 @@ Validating Bayesian inference algorithms with simulation-based calibration (2018
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import inspect
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-import numpyro
-import numpyro.distributions as dist
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy import stats
 
@@ -23,15 +21,34 @@ from dtprob.models.declaration import Model, trace_model
 
 DRAWS = 19
 """Draws that a true value is ranked among: its rank has 20 values, and the middle 18 are the 90% interval."""
+ENTRIES = 6
+"""Entries of a site that are ranked, at most: evenly spaced ones."""
 _NULL = 20_000
 _LEAN = RunOptions(pointwise=False, deterministics=False)
 
 
+class Simulated(NamedTuple):
+    """A data set.
+
+    Attributes:
+        data: the model's arguments.
+        truth: for each latent site the value behind them.
+    """
+
+    data: Mapping[str, Any]
+    truth: Mapping[str, np.ndarray]
+
+
 class Case(NamedTuple):
-    """A model to calibrate on: its data but for the observed ones."""
+    """A model to calibrate on.
+
+    Attributes:
+        model: the model.
+        simulate: from a key, a data set of the shapes of every other one.
+    """
 
     model: Model
-    data: Mapping[str, Any]
+    simulate: Callable[[PRNGKeyArray], Simulated]
 
 
 class Verdict(NamedTuple):
@@ -50,33 +67,63 @@ class Verdict(NamedTuple):
     mean: float
 
 
+def from_prior(model: Model, data: Mapping[str, Any]) -> Case:
+    """The case in which values are drawn from the prior, and data from these.
+
+    Args:
+        model: whose observed sites have the names of its arguments.
+        data: its arguments but for the observed ones.
+    """
+    arguments = set(inspect.signature(model).parameters) - set(data)
+
+    @jax.jit
+    def draw(key: PRNGKeyArray) -> tuple[dict[str, Any], dict[str, Any]]:
+        trace = trace_model(model, data, key)
+        values = {n: m["value"] for n, m in trace.items() if m["type"] == "sample"}
+        observed = {name: values.pop(name) for name in arguments & set(values)}
+        return observed, values
+
+    def simulate(key: PRNGKeyArray) -> Simulated:
+        observed, values = jax.tree.map(np.asarray, draw(key))
+        return Simulated({**data, **observed}, values)
+
+    return Case(model, simulate)
+
+
 def simulated_ranks(
-    engine: AbstractEngine, case: Case, key: PRNGKeyArray, runs: int
+    engine: AbstractEngine, case: Case, key: PRNGKeyArray, runs: Iterable[int]
 ) -> dict[str, Int[np.ndarray, " run"]]:
-    """Rank of the true value among thinned posterior draws, for each entry of each latent site.
+    """Rank of the true value among thinned posterior draws, for some entries of each latent site.
 
     Args:
         engine: gives a multiple of 19 draws, by chain and draw in an order that thinning can use.
-        case: the model; values are drawn from its prior, data from these.
+        case: the model, and where its data come from.
         key: typed JAX key.
-        runs: how many data sets.
+        runs: numbers of the data sets; each has data and draws of its own, whichever others there are.
     """
     found: dict[str, list[int]] = {}
-    for number in range(runs):
+    for number in runs:
         truth_key, fit_key, turn_key = jax.random.split(jax.random.fold_in(key, number), 3)
-        trace = trace_model(case.model, case.data, truth_key)
-        drawn = {n: m for n, m in trace.items() if m["type"] == "sample"}
-        data = {**case.data, **{n: np.asarray(m["value"]) for n, m in drawn.items() if n == "y"}}
+        data, truth = case.simulate(truth_key)
         posterior = engine(fit_key, case.model, data, options=_LEAN)
         turn = float(jax.random.uniform(turn_key, maxval=2 * np.pi))
         for name in posterior.latent:
-            values, truth = posterior.flat(name), np.asarray(drawn[name]["value"])
-            values = values[:: len(values) // DRAWS][:DRAWS].reshape(DRAWS, -1)
             measure = _turned(turn) if name in posterior.circular else np.asarray
-            below = np.sum(measure(values) < measure(truth.reshape(-1)), axis=0)
-            for entry, rank in enumerate(below):
-                found.setdefault(f"{name}[{entry}]" if truth.ndim else name, []).append(int(rank))
+            for label, rank in _ranks(name, posterior.flat(name), np.asarray(truth[name]), measure):
+                found.setdefault(label, []).append(rank)
     return {name: np.asarray(ranks) for name, ranks in found.items()}
+
+
+def _ranks(
+    name: str, draws: np.ndarray, truth: np.ndarray, measure: Callable[[np.ndarray], np.ndarray]
+) -> Iterator[tuple[str, int]]:
+    """By label, the rank of each chosen entry; those that the model leaves no choice of have none."""
+    thin = draws[:: len(draws) // DRAWS][:DRAWS].reshape(DRAWS, -1)
+    flat = truth.reshape(-1)
+    free = np.flatnonzero(np.any(thin != flat, axis=0))
+    for entry in free[np.unique(np.linspace(0, len(free) - 1, ENTRIES).astype(int))] if len(free) else free:
+        below = np.sum(measure(thin[:, entry]) < measure(flat[entry]))
+        yield f"{name}[{entry}]" if truth.ndim else name, int(below)
 
 
 def _turned(direction: float) -> Callable[[np.ndarray], np.ndarray]:
@@ -107,33 +154,3 @@ def _unevenness(counts: Int[np.ndarray, "*study bin"]) -> Float[np.ndarray, " *s
     """Cramer and von Mises's distance of the counts from even ones: neighbouring bins count together."""
     share = np.cumsum(counts, axis=-1) / np.sum(counts, axis=-1, keepdims=True)
     return np.mean((share - np.arange(1, counts.shape[-1] + 1) / counts.shape[-1]) ** 2, axis=-1)
-
-
-def _normal(x: Any, y: Any = None) -> None:
-    level = numpyro.sample("level", dist.Normal(1.0, 2.0))
-    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
-    with numpyro.plate("row", len(x)):
-        numpyro.sample("y", dist.Normal(level + slope * x, 1.0), obs=y)
-
-
-def _circular(x: Any, y: Any = None) -> None:
-    scale = numpyro.sample("scale", dist.LogNormal(0.0, 0.5))
-    angle = numpyro.sample("angle", dist.VonMises(np.pi, 1.0))
-    with numpyro.plate("row", len(x)):
-        numpyro.sample("y", dist.Normal(scale * jnp.cos(angle - x), 0.7), obs=y)
-
-
-def _hierarchical(x: Any, y: Any = None) -> None:
-    centre = numpyro.sample("centre", dist.Normal(0.0, 1.0))
-    spread = numpyro.sample("spread", dist.LogNormal(-0.5, 0.5))
-    with numpyro.plate("group", len(x)):
-        level = numpyro.sample("level", dist.Normal(centre, spread))
-        numpyro.sample("y", dist.Normal(level, x), obs=y)
-
-
-CASES: Mapping[str, Case] = {
-    "normal": Case(_normal, {"x": np.linspace(-1, 2, 6)}),
-    "circular": Case(_circular, {"x": np.linspace(-1, 2, 6)}),
-    "hierarchical": Case(_hierarchical, {"x": np.linspace(0.3, 1.2, 5)}),
-}
-"""Small models: a linear regression, a phase with an amplitude, groups around a common centre."""

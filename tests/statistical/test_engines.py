@@ -7,7 +7,8 @@ from arviz_stats.base import array_stats
 from scipy import stats
 
 from dtprob.inference import NUTS, SMC, SVI, BlackJAXNUTS, Ensemble, Exact, Laplace, RunOptions
-from dtprob.testing.calibration import CASES, DRAWS, judge, simulated_ranks
+from dtprob.testing.calibration import DRAWS, judge, simulated_ranks
+from dtprob.testing.calibration_cases import CASES
 from tests.unit.inference.examples import logistic, logistic_data
 
 RATE = 1e-3
@@ -56,7 +57,7 @@ ENGINES = {
 def test_ranks_are_uniform(name):
     """Ranks of true values are even (simulated null) and 90% intervals hold them (exact), at the declared rate."""
     engine, runs = ENGINES[name]
-    ranks = simulated_ranks(engine, CASES[name.split(", ")[1]], jax.random.key(3), runs)
+    ranks = simulated_ranks(engine, CASES[name.split(", ")[1]](), jax.random.key(3), range(runs))
     for site, found in ranks.items():
         verdict = judge(found)
         assert verdict.p_value > RATE / len(ranks), site
