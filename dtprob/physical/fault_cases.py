@@ -1,9 +1,10 @@
-"""What tracks of faulty Gaussian measurements share: which faults a case has, and the records of its key."""
+"""What tracks of faulty Gaussian measurements share: which faults a case has, and how cases and records are written."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -11,14 +12,14 @@ import numpy as np
 
 from dtprob.errors import InputError
 from dtprob.files import atomic_write
-from dtprob.physical.gaussian import Bench, Fault, Sized, sized, visible
+from dtprob.physical.gaussian import Bench, Fault, Sized, Vector, measure, sized, visible
 
 KINDS: Final = ("null", "listed", "unlisted", "pair", "triple")
+SHARED: Final = 8
+"""Cases of one campaign."""
 _TRIES: Final = 60
 _APART: Final = 0.5
 """Faults of one case correlate less than this in what the twin cannot imitate."""
-_SILENT: Final = 1e-6
-"""Standard deviations of a mean below which a fault leaves it alone."""
 
 
 class Choice(NamedTuple):
@@ -91,33 +92,91 @@ def _apart(bench: Bench, one: Sized, other: Sized) -> bool:
     if one.fault.family == other.fault.family:
         return False
     a, b = (visible(bench, each.fault.change(bench.law, each.size)) for each in (one, other))
-    norms = np.linalg.norm(a), np.linalg.norm(b)
-    if max(norms) < _SILENT:
-        return False
-    return bool(abs(np.sum(a * b)) <= _APART * norms[0] * norms[1])
+    return abs(float(a @ b)) <= _APART * float(np.linalg.norm(a) * np.linalg.norm(b))
 
 
-def write_record(
-    out: Path, name: str, kind: str, target: float, *, choice: Choice, more: Mapping[str, Any]
+class Setup(NamedTuple):
+    """One measurement campaign, of which several cases are made.
+
+    Attributes:
+        bench: the sound law, and what the twin can fit.
+        families: what can be wrong.
+        write: (folder, measurements (block, row), families left out, seed of the diagnosis) writes a case.
+        more: what else the key tells.
+    """
+
+    bench: Bench
+    families: Families
+    write: Callable[[Path, Vector, Sequence[str], int], None]
+    more: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Study:
+    """Which cases are asked for.
+
+    Attributes:
+        count: how many.
+        seed: from which everything is drawn.
+        kinds: of cases, in turn.
+        lambdas: information of each fault alone, drawn from these.
+    """
+
+    count: int
+    seed: int
+    kinds: Sequence[str]
+    lambdas: Sequence[float]
+
+
+def generate(
+    out: Path,
+    study: Study,
+    make: Callable[[np.random.Generator, int], Setup],
+    *,
+    resume: bool,
+    progress: Callable[[int, int], None] | None,
 ) -> None:
-    """Write what is true of one case, `truth/NAME.json`; it comes last, as the sign that the case is whole.
+    """Write the cases of a study, each with its record last.
 
     Args:
         out: folder of the study.
-        name: of the case.
-        kind: of case.
-        target: lambda that was asked for.
-        choice: its faults.
-        more: what else the key tells.
+        study: what is asked for.
+        make: (rng, number of the campaign) -> the campaign.
+        resume: keep the cases that are whole.
+        progress: called with the number of cases done and of all.
     """
-    record = {
-        "name": name,
-        "kind": kind,
-        "lambda": target if choice.faults else 0.0,
-        "effects": [one.record() for one in choice.faults],
-        "excluded": list(choice.excluded),
-        "alias": None,
-        **more,
-    }
-    with atomic_write(out / "truth" / f"{name}.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    for index in range(study.count):
+        name, draws = f"{index:04d}", (study.seed, index)
+        if not (resume and (out / "truth" / f"{name}.json").is_file()):
+            number = index // SHARED
+            setup = make(np.random.default_rng([study.seed, number, 0]), number)
+            rng, kind = np.random.default_rng([*draws, 1]), study.kinds[index % len(study.kinds)]
+            target = study.lambdas[int(rng.integers(len(study.lambdas)))]
+            choice, law = choose(rng, kind, setup.bench, target, setup.families), setup.bench.law
+            for one in choice.faults:
+                law = one.fault.change(law, one.size)
+            measured = measure(np.random.default_rng([*draws, 2]), law)
+            setup.write(out / "cases" / name, measured, choice.excluded, index)
+            record = {
+                "name": name,
+                "kind": kind,
+                "lambda": target if choice.faults else 0.0,
+                "effects": [one.record() for one in choice.faults],
+                "excluded": list(choice.excluded),
+                "alias": None,
+                **setup.more,
+            }
+            write_text(out / "truth" / f"{name}.json", json.dumps(record, indent=1))
+        if progress:
+            progress(index + 1, study.count)
+
+
+def left_out(excluded: Sequence[str]) -> str:
+    """The line of a CASE's [effects] that leaves some out; nothing where there are none."""
+    return f"exclude = {json.dumps(list(excluded))}\n" if excluded else ""
+
+
+def write_text(file: Path, text: str) -> None:
+    """Write a text file whole."""
+    with atomic_write(file) as temporary:
+        temporary.write_text(text, encoding="utf-8")

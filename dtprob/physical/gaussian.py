@@ -24,6 +24,8 @@ _TOLERANCE: Final = 0.15
 """Relative error of lambda that counts as met."""
 _WIDEST: Final = 6.0
 """How far the logarithms of the covariance's parameters may move."""
+_STEP: Final = 1e-4
+"""Of these logarithms, for derivatives."""
 
 
 @dataclass(frozen=True)
@@ -142,11 +144,24 @@ def information(bench: Bench, law: Law) -> float:
     return max(0.0, min(float(found.fun), twice(bench.start)))
 
 
-def visible(bench: Bench, law: Law) -> Vector:
-    """What a fault changes of the mean beyond what the twin's coefficients imitate, in standard deviations."""
+def visible(bench: Bench, law: Law) -> Float[np.ndarray, " direction"]:
+    """What a fault changes beyond what the twin can imitate, to first order, in standard deviations.
+
+    The change of the mean, then that of the covariance; the square of its length is lambda where that is small.
+    """
     inverse = np.linalg.inv(bench.law.covariance)
+    root = np.linalg.cholesky(inverse)
     left = _remaining(law.mean - bench.law.mean, bench.tangents, inverse)
-    return np.einsum("bij,bi->bj", np.linalg.cholesky(inverse), left)
+
+    def white(covariance: Covariance) -> np.ndarray:
+        change = covariance - bench.law.covariance
+        return (np.einsum("bki,bkl,blj->bij", root, change, root) / np.sqrt(2)).reshape(-1)
+
+    steps = bench.start + _STEP * np.eye(len(bench.start))
+    basis = np.stack([white(bench.family(step)) for step in steps], axis=1)
+    spread = white(law.covariance)
+    spread = spread - basis @ np.linalg.lstsq(basis, spread, rcond=None)[0]
+    return np.concatenate([np.einsum("bji,bj->bi", root, left).reshape(-1), spread])
 
 
 def sized(bench: Bench, fault: Fault, target: float) -> Sized | None:

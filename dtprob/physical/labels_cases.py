@@ -6,8 +6,8 @@ survey to survey and is told to nobody.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -15,15 +15,12 @@ import numpy as np
 
 from dtprob.data.kinds import Labels
 from dtprob.data.write import write
-from dtprob.files import atomic_write
-from dtprob.physical.fault_cases import KINDS, Choice, Families, choose, write_record
-from dtprob.physical.gaussian import measure
+from dtprob.physical.fault_cases import KINDS, Families, Setup, Study, generate, left_out, write_text
+from dtprob.physical.gaussian import Vector
 from dtprob.physical.key import checked, write_key
 from dtprob.physical.labels_faults import FAMILIES, FOREIGN, LISTED, draw
 from dtprob.physical.labels_survey import BLOCKS, ROWS, Survey, make_survey
 
-SHARED: Final = 8
-"""Cases of one survey's places and map."""
 CONVENTION: Final = (
     "lambda is twice the divergence of the labels' law from the nearest law of the twin, whose standard deviation is"
     " fitted; exact for every size"
@@ -63,39 +60,28 @@ def generate_cases(
         InputError: an unknown kind or family, or a lambda that no fault can reach.
     """
     lambdas = checked(kinds, lambda_, families, known_kinds=KINDS, known_families=FAMILIES)
-    for index in range(count):
-        if not (resume and (out / "truth" / f"{index:04d}.json").is_file()):
-            survey = make_survey(np.random.default_rng([seed, index // SHARED, 0]))
-            rng = np.random.default_rng([seed, index, 1])
-            target, kind = lambdas[int(rng.integers(len(lambdas)))], kinds[index % len(kinds)]
-            drawn = Families(lambda rng, family, survey=survey: draw(rng, family, survey), families, FOREIGN)
-            choice = choose(rng, kind, survey.bench, target, drawn)
-            _write(out, index, survey, choice, np.random.default_rng([seed, index, 2]))
-            more = {"deviation": survey.deviation}
-            write_record(out, f"{index:04d}", kind, target, choice=choice, more=more)
-        if progress:
-            progress(index + 1, count)
+
+    def make(rng: np.random.Generator, _: int) -> Setup:
+        survey = make_survey(rng)
+        drawn = Families(lambda rng, family: draw(rng, family, survey), families, FOREIGN)
+        return Setup(survey.bench, drawn, partial(_write, survey), {"deviation": survey.deviation})
+
+    generate(out, Study(count, seed, kinds, lambdas), make, resume=resume, progress=progress)
     plan = {"labels": BLOCKS * ROWS}
     return write_key(out, count, seed, track="labels", convention=CONVENTION, plan=plan)
 
 
-def _write(out: Path, index: int, survey: Survey, choice: Choice, rng: np.random.Generator) -> None:
-    """Measure and write one case."""
-    law = survey.bench.law
-    for one in choice.faults:
-        law = one.fault.change(law, one.size)
-    label = np.round(measure(rng, law).reshape(-1), 2)
-    folder = out / "cases" / f"{index:04d}"
-    folder.mkdir(parents=True, exist_ok=True)
+def _write(survey: Survey, folder: Path, measured: Vector, excluded: Sequence[str], seed: int) -> None:
+    """Write one case."""
+    label = np.round(measured.reshape(-1), 2)
     all_labelled = np.ones(len(label), bool)
+    folder.mkdir(parents=True, exist_ok=True)
     data = Labels(x=survey.x, y=label, labelled=all_labelled, prediction=survey.prediction)
     write(folder / "labels.csv", data)
-    with atomic_write(folder / "case.toml") as temporary:
-        temporary.write_text(_toml(choice.excluded, index), encoding="utf-8")
+    write_text(folder / "case.toml", _toml(excluded, seed))
 
 
 def _toml(excluded: Sequence[str], seed: int) -> str:
-    left_out = f"exclude = {json.dumps(list(excluded))}\n" if excluded else ""
     return f"""[model]
 name = "label_twin"
 
@@ -104,7 +90,7 @@ file = "labels.csv"
 
 [effects]
 use = "all"
-{left_out}
+{left_out(excluded)}
 [engine]
 name = "laplace"
 

@@ -69,10 +69,18 @@ def test_what_the_twin_can_fit_is_no_information():
     other = rng.standard_normal((5, 8))
     matrix, target = tangents.reshape(40, 2), other.reshape(40)
     left = target - matrix @ np.linalg.lstsq(matrix, target, rcond=None)[0]
-    found = visible(bench, shifted(other)(law, 1.0)).reshape(40)
-    np.testing.assert_allclose(found, left, atol=1e-9)
+    found = visible(bench, shifted(other)(law, 1.0))
+    np.testing.assert_allclose(found, [*left, *np.zeros(5 * 64)], atol=1e-9)
     found = information(bench, shifted(other)(law, 0.5))
     assert found == pytest.approx(40 * np.log1p(np.mean((0.5 * left) ** 2)), rel=1e-4)
+
+
+@pytest.mark.parametrize("family", ["label_noise", "regional_bias", "autocorrelated_errors"])
+def test_what_can_be_seen_of_a_small_fault_is_its_information(family):
+    fault = draw(np.random.default_rng(0), family, SURVEY)
+    law = fault.change(BENCH.law, 0.05)
+    seen = visible(BENCH, law)
+    assert seen @ seen == pytest.approx(information(BENCH, law), rel=0.1)
 
 
 def test_a_draw_follows_its_law():
@@ -94,7 +102,7 @@ def test_several_faults_can_be_told_apart():
     for seed in range(6):
         found = choose(np.random.default_rng(seed), "triple", BENCH, 50.0, families).faults
         assert len({one.fault.family for one in found}) == 3
-        seen = [visible(BENCH, one.fault.change(BENCH.law, one.size)).reshape(-1) for one in found]
+        seen = [visible(BENCH, one.fault.change(BENCH.law, one.size)) for one in found]
         for i in range(3):
             for j in range(i):
                 assert abs(seen[i] @ seen[j]) <= 0.5 * np.linalg.norm(seen[i]) * np.linalg.norm(seen[j])
