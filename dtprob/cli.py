@@ -104,7 +104,7 @@ def _add_withheld(added: argparse.ArgumentParser) -> None:
     parts = added.add_subparsers(metavar="STEP", dest="step", required=True)
     generate = parts.add_parser("generate", help="make cases/NNNN/ and, apart from them, key.json")
     generate.add_argument(
-        "--track", required=True, metavar="TRACK", help="kind of twin: channel, network or labels"
+        "--track", required=True, metavar="TRACK", help="kind of twin: channel, network, labels or custom"
     )
     generate.add_argument("--count", type=int, required=True, metavar="N", help="number of cases")
     generate.add_argument("--seed", type=int, default=0, metavar="S", help="where randomness starts")

@@ -18,6 +18,7 @@ TRACKS: Final = {
     "channel": "dtprob.physical.cases",
     "network": "dtprob.physical.multi_access.cases",
     "labels": "dtprob.physical.labels_cases",
+    "custom": "dtprob.physical.custom_cases",
 }
 """For each track, the module whose `generate_cases` writes its cases and their key."""
 

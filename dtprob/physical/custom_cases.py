@@ -1,0 +1,137 @@
+"""Withheld cases of models that users declare themselves: a regression on a table, and a state-space model.
+
+Each case is a folder with `case.toml`, the data, and the user's model and effects as modules beside it; diagnosing it runs
+that code. The campaigns' levels, exponents and errors are told to nobody.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from dtprob.files import atomic_write
+from dtprob.physical import custom_fading as fading
+from dtprob.physical import custom_path_loss as path_loss
+from dtprob.physical.fault_cases import KINDS, Families, Setup, Study, generate, left_out, write_text
+from dtprob.physical.gaussian import Vector
+from dtprob.physical.key import checked, write_key
+
+FAMILIES: Final = tuple(dict.fromkeys([*path_loss.FAMILIES, *fading.FAMILIES]))
+FOREIGN: Final = (*path_loss.FOREIGN, *fading.FOREIGN)
+LISTED: Final = tuple(name for name in FAMILIES if name not in FOREIGN)
+CONVENTION: Final = (
+    "lambda is twice the divergence of the measurements' law from the nearest law of the twin, whose level, exponent and"
+    " spread are fitted; exact for every size"
+)
+_CODE: Final = Path(__file__).parent / "user_code"
+
+
+def generate_cases(
+    out: Path,
+    count: int,
+    seed: int,
+    kinds: Sequence[str] = KINDS,
+    lambda_: float | Sequence[float] = (25.0, 100.0, 400.0),
+    *,
+    families: Sequence[str] = LISTED,
+    resume: bool = False,
+    progress: Callable[[int, int], None] | None = None,
+) -> Path:
+    """Write withheld cases and their key; campaigns with streets and with runs take turns.
+
+    Case i is of kind `kinds[i % len(kinds)]`; its lambda is drawn from those given.
+
+    Args:
+        out: folder; cases go to `cases/NNNN`, `key.json` and `truth/NNNN.json` stay outside of `cases`.
+        count: number of cases.
+        seed: from which everything is drawn.
+        kinds: "null" no fault, "listed" one fault, "unlisted" one whose family the case takes out of the user's effects, or
+            that these never had, "pair" and "triple" several that can be told apart.
+        lambda_: information that each fault carries alone.
+        families: which faults may occur.
+        resume: keep the cases that are whole.
+        progress: called with the number of cases done and `count`.
+
+    Returns:
+        The key's file.
+
+    Raises:
+        InputError: an unknown kind or family, or a lambda that no fault can reach.
+    """
+    lambdas = checked(kinds, lambda_, families, known_kinds=KINDS, known_families=FAMILIES)
+
+    def make(rng: np.random.Generator, number: int) -> Setup:
+        return _runs(rng, families) if number % 2 else _streets(rng, families)
+
+    generate(out, Study(count, seed, kinds, lambdas), make, resume=resume, progress=progress)
+    plan = {"streets": [path_loss.STREETS, path_loss.ROWS], "runs": [fading.RUNS, fading.STEPS]}
+    return write_key(out, count, seed, track="custom", convention=CONVENTION, plan=plan)
+
+
+def _streets(rng: np.random.Generator, families: Sequence[str]) -> Setup:
+    made = path_loss.make_streets(rng)
+    known = [name for name in path_loss.FAMILIES if name in families]
+    drawn = Families(lambda rng, family: path_loss.draw(rng, family, made), known, path_loss.FOREIGN)
+    more = {"level": made.level, "exponent": made.exponent, "error": made.error}
+    return Setup(made.bench, drawn, partial(_write_streets, made), {"model": "path_loss", **more})
+
+
+def _runs(rng: np.random.Generator, families: Sequence[str]) -> Setup:
+    made = fading.make_runs(rng)
+    known = [name for name in fading.FAMILIES if name in families]
+    drawn = Families(lambda rng, family: fading.draw(rng, family, made), known, fading.FOREIGN)
+    names = ("level", "exponent", "correlation", "fading", "noise")
+    more = {name: getattr(made, name) for name in names}
+    return Setup(made.bench, drawn, partial(_write_runs, made), {"model": "slow_fading", **more})
+
+
+def _write_streets(
+    made: path_loss.Streets, folder: Path, power: Vector, excluded: Sequence[str], seed: int
+) -> None:
+    """A table with a row per measurement."""
+    segment = np.repeat(np.arange(path_loss.STREETS), path_loss.ROWS)
+    columns = (made.place[..., 0], made.place[..., 1], made.minutes, segment, power)
+    rows = np.column_stack([np.reshape(column, -1) for column in columns])
+    with atomic_write(folder / "table.csv") as temporary:
+        form = ["%.2f", "%.2f", "%.3f", "%d", "%.3f"]
+        np.savetxt(
+            temporary, rows, fmt=form, delimiter=",", header="east,north,time,segment,power", comments=""
+        )
+    options = f"\n[model.options]\nsegments = {path_loss.STREETS}\n"
+    _write_code(folder, "path_loss", "table.csv", "segment", options=options, excluded=excluded, seed=seed)
+
+
+def _write_runs(made: fading.Runs, folder: Path, power: Vector, excluded: Sequence[str], seed: int) -> None:
+    """Arrays with a row per run."""
+    with atomic_write(folder / "runs.npz") as temporary:
+        np.savez(temporary, distance=made.distance, power=power)
+    _write_code(folder, "slow_fading", "runs.npz", "run", options="", excluded=excluded, seed=seed)
+
+
+def _write_code(
+    folder: Path, name: str, data: str, cluster: str, *, options: str, excluded: Sequence[str], seed: int
+) -> None:
+    """The user's modules, and the CASE that names them."""
+    for module in (name, f"{name}_effects"):
+        write_text(folder / f"{module}.py", (_CODE / f"{module}.py.txt").read_text(encoding="utf-8"))
+    text = f"""[model]
+name = "{name}:{name}"
+{options}
+[data]
+file = "{data}"
+cluster = "{cluster}"
+
+[effects]
+use = "{name}_effects:effects"
+{left_out(excluded)}
+[engine]
+name = "laplace"
+
+[seed]
+value = {seed}
+"""
+    write_text(folder / "case.toml", text)
