@@ -40,6 +40,9 @@ class COMA:
         scale: reward that counts as one.
         frame: slots of the frame whose phase the critic sees.
         capacity: packets that a buffer holds.
+        caution: how much more the environments count whose parameters pay less, per unit of reward and slot; 0 is the
+            plain mean. What is maximised is the entropic risk over the draws; a point estimate has one draw, and
+            nothing to be cautious about.
     """
 
     actor_rate: float = 5e-3
@@ -52,6 +55,7 @@ class COMA:
     scale: float = 100.0
     frame: int = 4
     capacity: int = 1
+    caution: float = 0.0
 
     def start(self, key: PRNGKeyArray, policy: Any) -> Kept:
         """See `Learner`."""
@@ -68,14 +72,15 @@ class COMA:
         fall = 1 - 0.9 * progress
         returns, counts = self.returns(kept.target, trajectory)
         critic, critic_state = kept.critic, kept.critic_state
+        weight = counts * self.weight(trajectory)
         error = jnp.zeros(())
         for _ in range(self.critic_steps):
-            error, slope = eqx.filter_value_and_grad(critic_loss)(critic, trajectory, returns, counts)
+            error, slope = eqx.filter_value_and_grad(critic_loss)(critic, trajectory, returns, weight)
             critic, critic_state = self._apply(critic, slope, critic_state, self.critic_rate * fall)
         advantage = self.advantage(critic, trajectory)
         entropy = self.entropy * jnp.maximum(0.0, 1 - 1.5 * progress)
         slope = eqx.filter_grad(actor_loss)(
-            policy, memory, trajectory, advantage, counts=counts, entropy=entropy
+            policy, memory, trajectory, advantage, weight=weight, entropy=entropy
         )
         policy, actor_state = self._apply(policy, slope, kept.actor_state, self.actor_rate * fall)
         updates = kept.updates + 1
@@ -93,6 +98,11 @@ class COMA:
         value = taken(values(target, trajectory), trajectory.action)
         reward = trajectory.reward / self.scale
         return device_returns(reward, value, trajectory.truncated, self.discount, self.mix)
+
+    def weight(self, trajectory: Trajectory) -> Float[Array, " environment"]:
+        """How much each environment counts, 1 on average: exp(-caution reward), tilted to what pays least."""
+        pay = jnp.mean(trajectory.reward, axis=0) / self.scale
+        return jax.nn.softmax(-self.caution * pay) * len(pay)
 
     def advantage(
         self, critic: CentralCritic, trajectory: Trajectory
@@ -123,11 +133,11 @@ def critic_loss(
     critic: CentralCritic,
     trajectory: Trajectory,
     returns: Float[Array, "slot environment device"],
-    counts: Bool[Array, "slot environment"],
+    weight: Float[Array, "slot environment"],
 ) -> Float[Array, ""]:
-    """Mean square difference from the returns."""
+    """Mean square difference from the returns, weighted."""
     error = taken(values(critic, trajectory), trajectory.action) - returns
-    return jnp.mean(error**2 * counts[..., None])
+    return jnp.mean(error**2 * weight[..., None])
 
 
 def actor_loss(
@@ -136,11 +146,11 @@ def actor_loss(
     trajectory: Trajectory,
     advantage: Float[Array, "slot environment device"],
     *,
-    counts: Bool[Array, "slot environment"],
+    weight: Float[Array, "slot environment"],
     entropy: Float[Array, ""],
 ) -> Float[Array, ""]:
     """Minus the weighted log-probability of the actions taken, and minus the entropy; an empty buffer has no say."""
     logit = unroll_each(policy, memory, trajectory.observation, trajectory.start)
-    matters = (trajectory.observation.buffer > 0) * counts[..., None]
+    matters = (trajectory.observation.buffer > 0) * weight[..., None]
     gain = log_chance(logit, trajectory.action) * advantage
     return -jnp.mean(matters * (gain + entropy * choice_entropy(logit)))

@@ -1,13 +1,14 @@
 """The reference network for figures: data collected at random, the twin's posteriors, training, exact judgement."""
 
 from collections.abc import Mapping, Sequence
-from typing import Final, Literal, NamedTuple, get_args
+from typing import Final, Literal, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
+from scipy.special import expit
 
 from dtprob.control import (
     COMA,
@@ -16,11 +17,9 @@ from dtprob.control import (
     FramePolicy,
     TablePolicy,
     draw_pool,
-    tabulate,
     train,
 )
 from dtprob.control.kernel import Kernel
-from dtprob.control.learner import Learner
 from dtprob.control.rollout import Trajectory, begin, play
 from dtprob.inference import PointMass, Sampler
 from dtprob.inference.exact import DirichletTables
@@ -30,7 +29,6 @@ from dtprob.physical.multi_access import Averages, Chain, Network, PhysicalKerne
 type Method = Literal["bayesian", "map", "maximum_likelihood"]
 type Counts = Mapping[str, Float[np.ndarray, "..."]]
 
-METHODS: Final[tuple[Method, ...]] = get_args(Method.__value__)
 NETWORK: Final = Network.reference()
 TWIN: Final = kernel(NETWORK.clusters, NETWORK.capacity)
 CONCENTRATION: Final[Mapping[Method, float]] = {"bayesian": 0.01, "map": 1.01, "maximum_likelihood": 1.0}
@@ -130,7 +128,7 @@ class Campaign(NamedTuple):
         starts: random rules from which the best local rule is sought.
     """
 
-    learner: Learner = COMA()
+    learner: COMA = COMA()
     budget: Budget = Budget(slots=120_000)
     kernel: Kernel = TWIN
     starts: int = 12
@@ -147,19 +145,21 @@ class Campaign(NamedTuple):
         keys = jax.random.split(key, len(samplers))
         pools = [draw_pool(k, s, DRAWS) for k, s in zip(keys, samplers, strict=True)]
         stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *pools)
-        return np.asarray(_train(keys, stacked, self), float)
+        return expit(np.asarray(_train(keys, stacked, self), float))
 
 
 @eqx.filter_jit
 def _train(
     keys: PRNGKeyArray, pools: dict[str, jax.Array], campaign: Campaign
 ) -> Float[jax.Array, "run phase device buffer arrival ack"]:
+    """Log-odds of sending; as chances they would round to 0 and 1 in single precision."""
+
     def one(key: PRNGKeyArray, pool: dict[str, jax.Array]) -> jax.Array:
         first, second = jax.random.split(key)
         environment = Environment(campaign.kernel, pool, HORIZON, REDRAW)
         start = FramePolicy(first, NETWORK.devices)
         trained = train(second, campaign.learner, start, environment, campaign.budget)
-        return tabulate(trained.policy).probability
+        return jnp.moveaxis(trained.policy.table(), -1, 0)
 
     return jax.vmap(one)(keys, pools)
 

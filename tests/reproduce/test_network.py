@@ -59,14 +59,14 @@ def test_the_figure_in_small(tmp_path):
     campaign = Campaign(COMA(), Budget(640, 8, 20), starts=0)
     found = fig2.figure(KEY, 2, Progress(folder=tmp_path / "parts"), (0, 4), campaign)
     names = [series.name for series in found.panels[0].series]
-    assert names == ["bayesian", "map", "maximum_likelihood", "oracle", "tdma", "aloha"]
+    assert names == [*fig2.LINES, "oracle", "tdma", "aloha"]
     level = {series.name: series.median for series in found.panels[0].series}
     np.testing.assert_allclose(level["tdma"], 1.0598, atol=5e-5)
     np.testing.assert_allclose(level["aloha"], 0.7786, atol=5e-5)
     assert all(0.3 < value < 1.1625 for values in level.values() for value in values)
     assert json.dumps(found.to_dict(seed=0, command="", seconds=1.0))
     kept = len(list((tmp_path / "parts").iterdir()))
-    assert kept == 2 * 3 + 3  # methods and sizes; oracle, policies that remember, local rules
+    assert kept == 2 * len(fig2.LINES) + 3  # lines and sizes; oracle, policies that remember, local rules
 
 
 def test_errors_fall_with_counts_and_are_zero_in_the_limit():

@@ -14,7 +14,7 @@ from dtprob.control.coma import actor_loss, critic_loss, values
 from dtprob.control.critic import CentralCritic
 from dtprob.control.environment import Observation
 from dtprob.control.returns import counterfactual_advantage, lambda_returns
-from dtprob.control.rollout import begin, play
+from dtprob.control.rollout import Trajectory, begin, play
 from dtprob.physical.multi_access import aloha, average, chain
 from tests.unit.control.networks import PAIR, world
 
@@ -108,7 +108,7 @@ def test_the_actors_gradient_against_differences(kind):
     advantage = jax.random.normal(KEY, trajectory.logit.shape)
     counts = ~trajectory.truncated
     automatic, difference = slope_along(
-        lambda p: actor_loss(p, memory, trajectory, advantage, counts=counts, entropy=jnp.array(0.3)),
+        lambda p: actor_loss(p, memory, trajectory, advantage, weight=counts, entropy=jnp.array(0.3)),
         policy,
         1,
     )
@@ -161,3 +161,12 @@ def test_two_devices_learn_to_share(learner):
     before = average(exact, aloha(PAIR, 0.5)).throughput
     best = average(exact, aloha(PAIR, 1.0)).throughput
     assert before + 0.5 * (best - before) < got
+
+
+def test_caution_counts_more_what_pays_less():
+    reward = jnp.array([[10.0, 50.0, -30.0], [30.0, 10.0, -50.0]])  # (slot, environment); means 20, 30, -40
+    played = Trajectory(None, None, None, None, reward, None, None)
+    np.testing.assert_array_equal(COMA().weight(played), np.ones(3))
+    weight = np.asarray(COMA(caution=2.0, scale=10.0).weight(played), float)
+    assert weight.mean() == pytest.approx(1.0)
+    np.testing.assert_allclose(weight[0] / weight[1:], np.exp([2.0, -12.0]), rtol=1e-5)
