@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, final
+from typing import Any, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -70,30 +70,26 @@ class Compiled:
 
         return chunked
 
-    @cached_property
-    def residual(self) -> Any:
-        """X -> whitened residuals (cluster, row)."""
-
-        @jax.jit
-        def residual(x: Any, arrays: Any) -> jax.Array:
-            trace, _, _ = self._runner.run(x, arrays, {})
-            observed = self._runner.observations(trace).items()
-            return self._runner.rows.stack({n: whiten.residual(o, trace[n]["value"]) for n, o in observed})
-
-        return lambda x: residual(jnp.asarray(x), self._arrays)
+    def residual(self, x: np.ndarray) -> jax.Array:
+        """Whitened residuals (cluster, row) at x."""
+        return self.linearised(x, np.zeros((0, self._runner.layout.dimension)))[0]
 
     @cached_property
-    def columns(self) -> Any:
-        """(x, basis (k, dimension)) -> whitened tangents (cluster, row, k)."""
+    def linearised(self) -> Callable[[np.ndarray, np.ndarray], tuple[jax.Array, jax.Array]]:
+        """(x, basis (k, dimension)) -> whitened residuals (cluster, row) and tangents (cluster, row, k)."""
 
         @jax.jit
-        def columns(x: Any, basis: jax.Array, arrays: Any) -> jax.Array:
-            def parameters(x: Any) -> dict[str, whiten.Parameters]:
+        def linearised(x: Any, basis: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
+            def parameters(x: Any) -> tuple[dict[str, whiten.Parameters], dict[str, jax.Array]]:
                 trace, _, _ = self._runner.run(x, arrays, {})
-                return {name: o.parameters for name, o in self._runner.observations(trace).items()}
+                observed = self._runner.observations(trace)
+                return {n: o.parameters for n, o in observed.items()}, {
+                    n: trace[n]["value"] for n in observed
+                }
 
-            here, push = jax.linearize(parameters, x)
+            here, push, values = jax.linearize(parameters, x, has_aux=True)
             observations = self._runner.around(here)
+            residual = {n: whiten.residual(o, values[n]) for n, o in observations.items()}
 
             def shifted(direction: jax.Array) -> jax.Array:
                 tangent = push(direction)
@@ -101,17 +97,12 @@ class Compiled:
                     {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
                 )
 
-            return jnp.moveaxis(jax.lax.map(shifted, basis, batch_size=_CHUNK), 0, -1)
+            return self._runner.rows.stack(residual), jnp.moveaxis(jax.vmap(shifted)(basis), 0, -1)
 
-        def chunked(x: np.ndarray, basis: np.ndarray) -> jax.Array:
-            if not len(basis):
-                return jnp.zeros((*self._runner.rows.gather.shape, 0))
-            padded = np.concatenate([basis, np.zeros((-len(basis) % _CHUNK, self._runner.layout.dimension))])
-            starts = range(0, len(padded), _CHUNK)
-            parts = [
-                columns(jnp.asarray(x), jnp.asarray(padded[i : i + _CHUNK]), self._arrays) for i in starts
-            ]
-            return jnp.concatenate(parts, axis=-1)[..., : len(basis)]
+        def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[jax.Array, jax.Array]:
+            parts = [linearised(jnp.asarray(x), chunk, self._arrays) for chunk in _chunks(basis)]
+            columns = parts[0][1] if len(parts) == 1 else jnp.concatenate([c for _, c in parts], axis=-1)
+            return parts[0][0], columns[..., : len(basis)]
 
         return chunked
 
@@ -225,65 +216,73 @@ class Compiled:
             yield chunk
 
     @cached_property
-    def observations(self) -> Any:
-        """X -> the observed distributions by site."""
-
+    def _state(self) -> Callable[[np.ndarray], _State]:
         @quick_jit
-        def observations(x: Any, arrays: Any) -> dict[str, whiten.Parameters]:
+        def state(x: Any, arrays: Any) -> _State:
             trace, _, _ = self._runner.run(x, arrays, {})
-            return {n: o.parameters for n, o in self._runner.observations(trace).items()}
-
-        return lambda x: self._runner.around(observations(jnp.asarray(x), self._arrays))
-
-    @cached_property
-    def sites(self) -> Any:
-        """X -> values of the latent and deterministic sites, by name."""
-
-        @quick_jit
-        def sites(x: Any, arrays: Any) -> dict[str, jax.Array]:
-            trace, _, _ = self._runner.run(x, arrays, {})
-            return {
-                n: trace[n]["value"]
-                for n in [*self._runner.declaration.latent, *self._runner.declaration.deterministic]
-            }
-
-        return lambda x: sites(jnp.asarray(x), self._arrays)
-
-    @cached_property
-    def prior_curvature(self) -> Any:
-        """(x, basis (k, dimension)) -> minus Hessian of the log prior of the base latents times each basis vector."""
-
-        @quick_jit
-        def prior_curvature(x: Any, basis: jax.Array, arrays: Any) -> jax.Array:
-            slope = jax.grad(self._runner.log_prior)
-            return -jax.vmap(lambda b: jax.jvp(lambda y: slope(y, arrays), (x,), (b,))[1])(basis)
-
-        return lambda x, basis: prior_curvature(jnp.asarray(x), jnp.asarray(basis), self._arrays)
-
-    @cached_property
-    def prior_gradient(self) -> Any:
-        """X -> gradient of the log prior of the base latents."""
-        prior_gradient = quick_jit(jax.grad(self._runner.log_prior))
-        return lambda x: prior_gradient(jnp.asarray(x), self._arrays)
-
-    @cached_property
-    def prediction_error(self) -> Any:
-        """X -> squared error and squared signal of each cluster (cluster,), over observations with a location.
-
-        For log-normal observations, as received powers are, the error is in dB and the signal counts entries.
-        """
-
-        @quick_jit
-        def prediction_error(x: Any, arrays: Any) -> tuple[jax.Array, jax.Array]:
-            trace, _, _ = self._runner.run(x, arrays, {})
+            observed = self._runner.observations(trace)
             error, signal = {}, {}
-            for name, o in self._runner.observations(trace).items():
+            for name, o in observed.items():
                 zero = jnp.zeros(self._runner.shapes[name])
                 squared, power = _squared_error(o, trace[name]["value"])
                 error[name], signal[name] = zero.at[0].set(squared), zero.at[0].set(power)
-            return self._runner.rows.stack(error).sum(1), self._runner.rows.stack(signal).sum(1)
+            names = [*self._runner.declaration.latent, *self._runner.declaration.deterministic]
+            return _State(
+                {n: trace[n]["value"] for n in names},
+                {n: o.parameters for n, o in observed.items()},
+                self._runner.rows.stack(error).sum(1),
+                self._runner.rows.stack(signal).sum(1),
+            )
 
-        return lambda x: prediction_error(jnp.asarray(x), self._arrays)
+        return lambda x: state(jnp.asarray(x), self._arrays)
+
+    def sites(self, x: np.ndarray) -> dict[str, jax.Array]:
+        """Values of the latent and deterministic sites at x, by name."""
+        return self._state(x).sites
+
+    def observations(self, x: np.ndarray) -> dict[str, whiten.Observation]:
+        """The observed distributions at x, by site."""
+        return self._runner.around(self._state(x).observed)
+
+    def prediction_error(self, x: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        """Squared error and squared signal of each cluster (cluster,), over observations with a location.
+
+        For log-normal observations, as received powers are, the error is in dB and the signal counts entries.
+        """
+        state = self._state(x)
+        return state.error, state.signal
+
+    @cached_property
+    def prior(self) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """(x, basis (k, dimension)) -> gradient of the log prior of the base latents, minus its Hessian times the basis."""
+
+        @quick_jit
+        def prior(x: Any, basis: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
+            slope, push = jax.linearize(lambda y: jax.grad(self._runner.log_prior)(y, arrays), x)
+            return slope, -jax.vmap(push)(basis)
+
+        def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            parts = [prior(jnp.asarray(x), chunk, self._arrays) for chunk in _chunks(basis)]
+            return np.asarray(parts[0][0]), np.concatenate([c for _, c in parts])[: len(basis)]
+
+        return chunked
+
+
+class _State(NamedTuple):
+    """What a model says at a point: its sites, observed distributions, squared errors and squared signal of clusters."""
+
+    sites: dict[str, jax.Array]
+    observed: dict[str, whiten.Parameters]
+    error: jax.Array
+    signal: jax.Array
+
+
+def _chunks(basis: np.ndarray) -> Iterator[jax.Array]:
+    """Rows of a basis in chunks of one size, at least one, the last filled up with zeros."""
+    count = max(-(-len(basis) // _CHUNK), 1)
+    padded = np.concatenate([basis, np.zeros((count * _CHUNK - len(basis), basis.shape[1]))])
+    for start in range(0, len(padded), _CHUNK):
+        yield jnp.asarray(padded[start : start + _CHUNK])
 
 
 def _squared_error(

@@ -197,9 +197,7 @@ def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
             continue
         directions = np.zeros((block.size, problem.dimension))
         directions[np.arange(block.size), block.index[0]] = 1.0
-        precision = np.einsum(
-            "ki,ki->k", np.asarray(problem.compiled.prior_curvature(fitted.x, directions)), directions
-        )
+        precision = np.einsum("ki,ki->k", problem.compiled.prior(fitted.x, directions)[1], directions)
         variance = np.array([fitted.covariance[position[int(i)], position[int(i)]] for i in block.index[0]])
         size = problem.declaration.sites[block.name].size
         change = np.clip(1 - variance * np.maximum(precision, 0.0), 0.0, 1.0)

@@ -11,7 +11,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.effect import Effect
@@ -61,18 +60,15 @@ class Fit:
 
 def _system(problem: Problem, active: Active, x: np.ndarray) -> System:
     directions = basis(problem, active)
-    w = problem.compiled.columns(x, directions)
-    e = problem.compiled.residual(x)
+    e, w = (np.asarray(part) for part in problem.compiled.linearised(x, directions))
+    prior_gradient, hessian = problem.compiled.prior(x, directions)
     g_index, l_index = active.global_index, active.local_index
     n = len(g_index)
-    weight = jnp.asarray(active.weights)
-    score = np.asarray(jnp.einsum("cmk,cm->ck", w, e))
     weighted = np.asarray(active.weights)[:, None]
-    curvature = np.asarray(jnp.einsum("c,cmi,cmj->ij", weight, w[..., :n], w[..., :n]))
-    cross = np.asarray(jnp.einsum("cmi,cmj->cij", w[..., :n], w[..., n:]))
-    local = np.asarray(jnp.einsum("cmi,cmj->cij", w[..., n:], w[..., n:]))
-    prior_gradient = np.asarray(problem.compiled.prior_gradient(x))
-    hessian = np.asarray(problem.compiled.prior_curvature(x, directions))
+    score = (e[:, None, :] @ w)[:, 0]
+    shared, transposed = w[..., :n], np.swapaxes(w, 1, 2)
+    curvature = (shared * weighted[..., None]).reshape(-1, n).T @ shared.reshape(-1, n)
+    cross, local = transposed[:, :n] @ w[..., n:], transposed[:, n:] @ w[..., n:]
     _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])

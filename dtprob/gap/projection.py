@@ -94,8 +94,8 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     active = activate(problem, fitted.effects)
     directions = basis(problem, active)
     n = len(active.global_index)
-    w = problem.compiled.columns(fitted.x, directions)
-    hessian = np.asarray(problem.compiled.prior_curvature(fitted.x, directions))
+    _, w = problem.compiled.linearised(fitted.x, directions)
+    prior_slope, hessian = problem.compiled.prior(fitted.x, directions)
     _, effect_slope, effect_curvature = effect_prior(
         problem, Active(active.blocks, active.effects, active.weights, fitted.spread), fitted.x
     )
@@ -112,7 +112,7 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
         curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
     )
     inverse = np.linalg.inv(positive(curvature)) if n else curvature
-    slope = np.asarray(problem.compiled.prior_gradient(fitted.x)) + effect_slope
+    slope = prior_slope + effect_slope
     flat = np.zeros(problem.dimension)
     flat[active.global_index] = np.diag(hessian[:n][:, active.global_index])
     flat[active.local_index] = np.einsum("jcj->cj", hessian[n:][:, active.local_index])
