@@ -16,10 +16,11 @@ import numpy as np
 from dtprob.files import atomic_write
 from dtprob.physical import custom_fading as fading
 from dtprob.physical import custom_path_loss as path_loss
-from dtprob.physical.fault_cases import KINDS, Families, Setup, Study, generate, left_out, write_text
+from dtprob.physical.fault_cases import Families, Setup, Study, generate, left_out, write_text
 from dtprob.physical.gaussian import Vector
 from dtprob.physical.key import checked, write_key
 
+KINDS: Final = ("null", "listed", "unlisted", "pair")
 FAMILIES: Final = tuple(dict.fromkeys([*path_loss.FAMILIES, *fading.FAMILIES]))
 FOREIGN: Final = (*path_loss.FOREIGN, *fading.FOREIGN)
 LISTED: Final = tuple(name for name in FAMILIES if name not in FOREIGN)
@@ -50,7 +51,7 @@ def generate_cases(
         count: number of cases.
         seed: from which everything is drawn.
         kinds: "null" no fault, "listed" one fault, "unlisted" one whose family the case takes out of the user's effects, or
-            that these never had, "pair" and "triple" several that can be told apart.
+            that these never had, "pair" two that can be told apart.
         lambda_: information that each fault carries alone.
         families: which faults may occur.
         resume: keep the cases that are whole.

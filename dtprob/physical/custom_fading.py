@@ -12,7 +12,7 @@ from jaxtyping import Float
 from dtprob.errors import unknown_name
 from dtprob.physical.gaussian import Bench, Covariance, Fault, Law, Vector, shifted
 
-RUNS, STEPS = 24, 30
+RUNS, STEPS = 40, 20
 """Runs, and readings in each."""
 _LARGEST_DB: Final = 25.0
 _BURST: Final = 4
@@ -66,7 +66,7 @@ def make_runs(rng: np.random.Generator) -> Runs:
         begin + pace * np.arange(STEPS),
         rng.uniform(-45, -25),
         rng.uniform(2.6, 3.6),
-        rng.uniform(0.75, 0.9),
+        rng.uniform(0.5, 0.8),
         rng.uniform(3.0, 6.0),
         rng.uniform(1.0, 2.0),
     )

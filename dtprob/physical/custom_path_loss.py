@@ -12,10 +12,10 @@ from jaxtyping import Float
 from dtprob.errors import unknown_name
 from dtprob.physical.gaussian import Bench, Fault, Law, Vector, louder, shifted
 
-STREETS, ROWS = 20, 20
+STREETS, ROWS = 40, 10
 """Streets, and measurements in each."""
 BASE_STATION: Final = (400.0, 250.0, 25.0)
-STREET_DB: Final = 4.0
+STREET_DB: Final = 2.0
 """Standard deviation of a street's own level, which the twin knows."""
 _TOWN: Final = (800.0, 500.0)
 _STREET_LENGTH: Final = 80.0

@@ -18,6 +18,8 @@ KINDS: Final = ("null", "listed", "unlisted", "pair", "triple")
 SHARED: Final = 8
 """Cases of one campaign."""
 _TRIES: Final = 60
+_PATIENCE: Final = 8
+"""Faults that may be too much like the others before these are drawn anew."""
 _APART: Final = 0.5
 """Faults of one case correlate less than this in what the twin cannot imitate."""
 
@@ -63,14 +65,15 @@ def choose(rng: np.random.Generator, kind: str, bench: Bench, target: float, fam
     one = _one(rng, bench, target, families, families.known)
     if kind == "unlisted":
         return Choice((one,), (one.fault.family,))
-    found = [one]
-    count = {"listed": 1, "pair": 2, "triple": 3}[kind]
-    for _ in range(_TRIES):
+    found, count = [one], {"listed": 1, "pair": 2, "triple": 3}[kind]
+    for attempt in range(1, _TRIES):
         if len(found) == count:
             return Choice(tuple(found))
         other = _one(rng, bench, target, families, families.known)
         if all(_apart(bench, other, before) for before in found):
             found.append(other)
+        elif attempt % _PATIENCE == 0:
+            found = [other]
     raise InputError("withheld case", f"{count} faults that can be told apart", "fewer", "Name more families")
 
 
