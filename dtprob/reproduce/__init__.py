@@ -11,6 +11,8 @@ FIGURES: Final[Mapping[str, str]] = {
     "collection": "dtprob.reproduce.network_collection",
     "fig2": "dtprob.reproduce.fig2",
     "prediction": "dtprob.reproduce.prediction",
+    "fig6a": "dtprob.reproduce.fig6a",
+    "fig6b": "dtprob.reproduce.fig6b",
     "fig9": "dtprob.reproduce.fig9",
     "fig10": "dtprob.reproduce.fig10",
     "fig10_learned": "dtprob.reproduce.fig10_learned",

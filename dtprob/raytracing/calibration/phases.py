@@ -84,8 +84,8 @@ def reference(field: Field) -> Phasors:
     identity = jnp.eye(field.coupling.shape[-1])
     # paths that are missing, and those that nothing tells apart, make the matrix singular
     added = jnp.where(field.snr > 0, 1e-12 * jnp.max(field.snr, axis=1, keepdims=True), 1.0)
-    right = jnp.swapaxes(field.matched + 0.5 * field.concentration, 1, 2)
-    free = jnp.swapaxes(jnp.linalg.solve(field.coupling + added[:, :, None] * identity, right), 1, 2)
+    inverse = jnp.linalg.inv(field.coupling + added[:, :, None] * identity)
+    free = jnp.einsum("lpq,lsq->lsp", inverse, field.matched + 0.5 * field.concentration)
     snr = jnp.broadcast_to(field.snr[:, None], free.shape)
     kappa = jnp.where(snr > 1, 2 * jnp.sqrt(snr * jnp.maximum(snr - 1, 0.0)), 0.0)
     return Phasors(_mean(kappa * jnp.exp(1j * jnp.angle(free))), kappa)

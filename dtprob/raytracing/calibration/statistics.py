@@ -119,7 +119,8 @@ def _responses(
 def _project(responses: _Responses, channel: Array, powers: bool) -> Statistics:
     gram = _inner(responses.rx) * _inner(responses.tx) * _inner(responses.tone)
     product = lax.map(lambda link: _matched(*link), (responses, channel))
-    energy = jnp.sum(jnp.real(channel) ** 2 + jnp.imag(channel) ** 2, axis=(2, 3, 4))
+    square = jnp.real(channel) ** 2 + jnp.imag(channel) ** 2
+    energy = jnp.sum(square, axis=(2, 3, 4), dtype=jnp.real(product).dtype)
     size = int(np.prod(channel.shape[2:]))
     return Statistics(gram, product, energy, _power_statistics(responses, channel) if powers else None, size)
 

@@ -1,0 +1,195 @@
+"""An urban scene whose one material is to be found from channels between two arrays of 64 elements.
+
+The truth is traced by `dtprob.physical`, the twin by `dtprob.raytracing`; both know the scene, and walls are half-spaces
+on both sides (in the truth, slabs so thick that nothing returns from their backs).
+"""
+
+import functools
+from collections.abc import Mapping, Sequence
+from typing import Final, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Complex, Float, PRNGKeyArray
+
+from dtprob.physical.channel import Sounding, array_responses, path_channels, subcarriers
+from dtprob.physical.rays import Rays
+from dtprob.physical.tracing import scene_materials, trace
+from dtprob.physical.world import SPEED_OF_LIGHT, Material, World, planar_array
+from dtprob.raytracing.calibration import SCHEMES, Settings, Statistics, calibrate_runs, project
+from dtprob.raytracing.field import path_gain
+from dtprob.raytracing.paths import PathSet
+from dtprob.raytracing.trace import load_scene
+from dtprob.raytracing.trace import trace as trace_twin
+
+SCENE: Final = "munich"
+FREQUENCY: Final = 6e9
+SPACING: Final = 30e3
+SUBCARRIERS: Final = 64
+SIDE: Final = 8
+SNAPSHOTS: Final = 50
+SNR_DB: Final = 20.0
+DEPTH: Final = 10
+RAYS: Final = 1_000_000
+TRANSMITTER: Final = (8.5, 21.0, 27.0)
+RECEIVER: Final = (-20.0, 70.0, 1.5)
+"""Of the calibration, behind a corner: every path is reflected."""
+TRUE: Final = Material(5.31, 0.139, 10.0)
+"""Concrete at 6 GHz, ITU-R P.2040."""
+TESTS: Final = 20
+"""Receivers in the streets around the transmitter, which calibration has not seen."""
+TEST_RAYS: Final = 200_000
+
+
+NOTES: Final = (
+    (
+        f"Scene {SCENE} of sionna-rt at 6 GHz, depth {DEPTH}, one receiver behind a corner, {SNAPSHOTS} measurements,"
+        f" {SUBCARRIERS} subcarriers of 30 kHz, half-wavelength arrays, isotropic vertical elements; one material for all"
+        " objects, half-spaces of concrete in truth (permittivity 5.31, conductivity .139 S/m), 3 and .1 at the start."
+    ),
+    (
+        f"Error: |P - P_true| / P_true, mean over {TESTS} receivers in the streets that calibration has not seen; lines"
+        " are medians and bands quartiles over runs. The noise power is known to the schemes, the spread of phase errors"
+        " is not."
+    ),
+)
+
+
+class Truth(NamedTuple):
+    """The calibration receiver as it is.
+
+    Attributes:
+        world: with the calibration receiver alone.
+        rays: to it.
+    """
+
+    world: World
+    rays: Rays
+
+    @property
+    def noise_power(self) -> float:
+        """Of the noise per coefficient at `SNR_DB`: the sum over paths of |a_p|^2 over the ratio."""
+        return float(np.sum(np.abs(self.rays.gain) ** 2)) / 10 ** (SNR_DB / 10)
+
+
+class Twin(NamedTuple):
+    """Paths to the calibration receiver and to the test receivers; materials unknown."""
+
+    calibration: PathSet
+    tests: PathSet
+
+
+def world(side: int = SIDE) -> World:
+    """The truth with square arrays of so many rows and columns."""
+    array = planar_array(side, side, SPEED_OF_LIGHT / FREQUENCY / 2)
+    ends = np.array([TRANSMITTER]), np.array([RECEIVER])
+    return World(SCENE, FREQUENCY, *ends, array, array, materials=_concrete(), max_depth=DEPTH, rays=RAYS)
+
+
+@functools.cache
+def _concrete() -> Mapping[str, Material]:
+    place, element = np.zeros((1, 3)), np.zeros((1, 3))
+    return dict.fromkeys(scene_materials(World(SCENE, FREQUENCY, place, place, element, element)), TRUE)
+
+
+@functools.cache
+def scene() -> tuple[Truth, Twin]:
+    """Truth and twin."""
+    loaded = load_scene(SCENE, FREQUENCY)
+    random = np.random.default_rng(1)
+    streets = np.c_[random.uniform((-60, 20), (90, 120), (3 * TESTS, 2)), np.full(3 * TESTS, RECEIVER[2])]
+
+    def paths(receivers: Float[np.ndarray, "link 3"], rays: int) -> PathSet:
+        ends = np.tile(TRANSMITTER, (len(receivers), 1)), receivers
+        return trace_twin(loaded, *ends, max_depth=DEPTH, samples=rays, frequency=FREQUENCY, allow_empty=True)
+
+    tests = paths(streets, TEST_RAYS)
+    reached = np.flatnonzero(np.asarray(tests.mask).any(axis=1))[:TESTS]
+    place = world()
+    return Truth(place, trace(place)), Twin(paths(np.array([RECEIVER]), RAYS), tests.take(reached))
+
+
+def sounding() -> Sounding:
+    """The subcarriers; measurements have no time."""
+    return Sounding(subcarriers(SUBCARRIERS, SUBCARRIERS * SPACING), np.zeros(1))
+
+
+def turned(
+    truth: Truth, angles: Float[np.ndarray, "snapshot path"], side: int = SIDE
+) -> Complex[np.ndarray, "snapshot entry"]:
+    """Noiseless channels at the calibration receiver, whose paths are turned by these angles in rad."""
+    each = path_channels(world(side), truth.rays, sounding())
+    columns = each.reshape(angles.shape[1], -1).astype(np.complex64)
+    return np.exp(1j * angles).astype(np.complex64) @ columns
+
+
+def displaced(
+    truth: Truth, displacement: Float[np.ndarray, "snapshot 3"]
+) -> Complex[np.ndarray, "snapshot entry"]:
+    """Noiseless channels at receivers displaced by these vectors in m.
+
+    Paths are traced again by their images, which for specular reflection is exact: lengths, and with them phases and
+    delays, are those of the displaced receiver. Gains and directions, which a wavelength does not change, stay.
+    """
+    rays = truth.rays.shifted(displacement[None])
+    rx, tx = (part[0] for part in array_responses(truth.world, truth.rays))
+    spatial = np.einsum("pa,pb->abp", rx, tx).reshape(-1, len(rx)).astype(np.complex64)
+    grid = FREQUENCY + sounding().subcarrier_frequency
+    gain = np.where(truth.rays.mask[0], truth.rays.gain[0, 0], 0)
+    tones = gain[:, None] * np.exp(-2j * np.pi * np.modf(rays.delay[0, :, :, None] * grid)[0])
+    return np.stack([(spatial @ tone).reshape(-1) for tone in tones.astype(np.complex64)])
+
+
+def generator(key: PRNGKeyArray, run: int) -> np.random.Generator:
+    """Randomness of one run."""
+    return np.random.default_rng([*np.asarray(jax.random.key_data(key)).tolist(), run])
+
+
+def white(random: np.random.Generator, shape: tuple[int, int]) -> Complex[np.ndarray, "snapshot entry"]:
+    """Circular normal noise of unit variance."""
+    parts = random.standard_normal((2, *shape), np.float32)
+    return (parts[0] + 1j * parts[1]) * np.float32(np.sqrt(0.5))
+
+
+def statistics(twin: Twin, channel: Complex[np.ndarray, "snapshot entry"], side: int = SIDE) -> Statistics:
+    """What calibration sees of the measured channels of one run."""
+    array = planar_array(side, side, SPEED_OF_LIGHT / FREQUENCY / 2)
+    shaped = channel.reshape(1, len(channel), len(array), len(array), SUBCARRIERS)
+    frequency = jnp.asarray(sounding().subcarrier_frequency)
+    return project(
+        twin.calibration,
+        frequency,
+        jnp.asarray(shaped),
+        rx_array=jnp.asarray(array),
+        tx_array=jnp.asarray(array),
+    )
+
+
+def errors(runs: Sequence[Statistics], noise_power: float) -> dict[str, Float[np.ndarray, " run"]]:
+    """Relative error of the power sum_p |a_p|^2, mean over the test receivers, after each scheme, by run.
+
+    The true power is that of the twin's paths with the true material, so that the material alone makes errors.
+    """
+    _, twin = scene()
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runs)
+    n = twin.tests.n_object
+    right = _power(twin.tests, jnp.full((1, n), TRUE.permittivity), jnp.full((1, n), TRUE.conductivity))
+    found: dict[str, np.ndarray] = {}
+    for scheme in SCHEMES:
+        settings = Settings(scheme, law="half_space")
+        result = calibrate_runs(
+            twin.calibration, stacked, jnp.full(len(runs), noise_power), settings=settings
+        )
+        power = _power(twin.tests, result.permittivity, result.conductivity)
+        found[scheme] = np.asarray(jnp.mean(jnp.abs(power / right - 1), axis=1))
+    return found
+
+
+@jax.jit
+def _power(
+    paths: PathSet, permittivity: Float[jax.Array, "run object"], conductivity: Float[jax.Array, "run object"]
+) -> Float[jax.Array, "run link"]:
+    """Sum over paths of |a_p|^2."""
+    gain = jax.vmap(lambda e, s: path_gain(paths, e, s, law="half_space"))(permittivity, conductivity)
+    return jnp.sum(jnp.abs(gain) ** 2, axis=2)
