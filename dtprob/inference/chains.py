@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
@@ -26,7 +27,7 @@ class Walk:
     Attributes:
         kernel: the transition.
         method: chains one after the other, or side by side.
-        explore: steps before the angles' windows are centred, when the kernel starts anew; 0 without angles.
+        explore: steps before the angles' windows are centred; 0 without angles.
         warmup: steps in all that are not kept.
     """
 
@@ -66,21 +67,23 @@ def start(
     """The chains at their starting points, nothing adapted yet."""
 
     def one(point: Array, key: PRNGKeyArray) -> Chain:
-        return _begin(target, walk, point, point[target.angles], key, inputs)
+        centre = point[target.angles]
+        state = walk.kernel.init(target, jax.random.fold_in(key, START), point, Place(centre, inputs))
+        return Chain(state, centre, jnp.zeros((*centre.shape, 2), point.dtype))
 
     return walk.over_chains(one, points, keys)
 
 
-def recentre(target: Target, walk: Walk, chains: Chain, keys: PRNGKeyArray, inputs: Inputs) -> Chain:
-    """The chains with windows centred on their mean directions so far, and nothing adapted yet."""
+def recentre(target: Target, walk: Walk, chains: Chain) -> Chain:
+    """The chains with windows centred on their mean directions so far; what is adapted stays."""
 
-    def one(chain: Chain, key: PRNGKeyArray) -> Chain:
+    def one(chain: Chain) -> Chain:
         centre = jnp.arctan2(chain.resultant[:, 1], chain.resultant[:, 0])
         point = walk.kernel.position(chain.kernel)
         point = point.at[target.angles].set(recentred(point[target.angles], centre))
-        return _begin(target, walk, point, centre, key, inputs)
+        return _shifted(target, walk, chain, point, centre)
 
-    return walk.over_chains(one, chains, keys)
+    return walk.over_chains(one, chains)
 
 
 def advance(  # noqa: PLR0917  (settings first, since they are bound before compilation)
@@ -112,19 +115,11 @@ def advance(  # noqa: PLR0917  (settings first, since they are bound before comp
     return walk.over_chains(one, chains, jax.vmap(jax.random.fold_in, (0, None))(keys, STEP))
 
 
-def _begin(  # noqa: PLR0917
-    target: Target, walk: Walk, point: Array, centre: Array, key: PRNGKeyArray, inputs: Inputs
-) -> Chain:
-    state = walk.kernel.init(target, jax.random.fold_in(key, START), point, Place(centre, inputs))
-    return Chain(state, centre, jnp.zeros((*centre.shape, 2), point.dtype))
-
-
 def _step(  # noqa: PLR0917
     target: Target, walk: Walk, chain: Chain, key: PRNGKeyArray, number: Array, inputs: Inputs
 ) -> tuple[Chain, dict[str, Array]]:
     move_key, winding_key = jax.random.split(key)
-    index = jnp.where(number < walk.explore, number, number - walk.explore)
-    state, stats = walk.kernel.step(target, move_key, chain.kernel, index, Place(chain.centre, inputs))
+    state, stats = walk.kernel.step(target, move_key, chain.kernel, number, Place(chain.centre, inputs))
     chain = chain._replace(kernel=state)
     if target.angles.size:
         chain = _turn(target, walk, chain, winding_key, number)
@@ -140,6 +135,13 @@ def _turn(target: Target, walk: Walk, chain: Chain, key: PRNGKeyArray, number: A
     chain = chain._replace(resultant=chain.resultant + follows * direction)
     after = before.at[target.angles].set(redraw_winding(key, angles, chain.centre))
     after = jnp.where(number >= walk.warmup, after, before)
-    window = jax.value_and_grad(lambda u: window_of(target, u, chain.centre))
-    (old, old_slope), (new, new_slope) = window(before), window(after)
-    return chain._replace(kernel=walk.kernel.shift(chain.kernel, after, new - old, new_slope - old_slope))
+    return _shifted(target, walk, chain, after, chain.centre)
+
+
+def _shifted(target: Target, walk: Walk, chain: Chain, point: Array, centre: Array) -> Chain:
+    """The chain at a point with other winding numbers, and windows about other centres."""
+    window = jax.value_and_grad(functools.partial(window_of, target))
+    old, old_slope = window(walk.kernel.position(chain.kernel), chain.centre)
+    new, new_slope = window(point, centre)
+    state = walk.kernel.shift(chain.kernel, point, new - old, new_slope - old_slope)
+    return chain._replace(kernel=state, centre=centre)

@@ -90,7 +90,7 @@ def run_chains(
     check_key(key)
     target, inputs = build_target(model, data)
     explore = schedule.warmup // _EXPLORE_SHARE if target.angles.size else 0
-    walk = Walk(kernel_for(schedule.warmup - explore), schedule.method, explore, schedule.warmup)
+    walk = Walk(kernel_for(schedule.warmup), schedule.method, explore, schedule.warmup)
     draws = _Loop(target, inputs, walk, schedule, key, options, engine).run()
     positions = draws.pop("position")
     return assemble(target, inputs, positions, engine=engine, key=key, options=options, stats=draws)
@@ -117,7 +117,7 @@ class _Loop:
         with Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress:
             while done < total and not self._is_enough(done, kept):
                 if done == self.walk.explore > 0:
-                    chains = self._compiled(recentre)(chains, keys, self.inputs)
+                    chains = self._compiled(recentre)(chains)
                 end = self._chunk_end(done)
                 chains, blocks = self._advance(chains, keys, done, end)
                 if done >= self.walk.warmup:
