@@ -1,6 +1,6 @@
 """Simulation-based calibration of the engines, at full size.
 
-    python benchmarks/calibration.py [--engine NAME ...] [--case NAME ...] [--runs 300] [--seconds 600] [--write]
+    python benchmarks/calibration.py [--engine NAME ...] [--case NAME ...] [--runs 200] [--seconds 600] [--write]
 
 For each engine and model: values are drawn from the prior, data from them, and the true value is ranked among
 19 draws of the posterior of these data. An exact engine gives even ranks and 90% intervals that hold the true value
@@ -38,13 +38,13 @@ BLOCK = 20
 CHAIN = {"warmup": 300, "draws": 10 * DRAWS, "chains": 1}
 SETTINGS: dict[str, dict[str, Any]] = {
     "exact": {"draws": DRAWS},
-    "laplace": {"draws": DRAWS},
+    "laplace": {"draws": DRAWS, "starts": 2},
     "von_mises_em": {"draws": DRAWS},
-    "ensemble": {"members": DRAWS},
+    "ensemble": {"members": DRAWS, "starts": 2},
     "nuts": CHAIN,
     "blackjax_nuts": CHAIN,
-    "svi": {"draws": DRAWS},
-    "smc": {"draws": 20 * DRAWS, "chains": 1},
+    "svi": {"draws": DRAWS, "starts": 2},
+    "smc": {"draws": 10 * DRAWS, "chains": 1},
 }
 MODELS = ("multi_access", "phase_error_channel", "prediction_powered", "custom")
 
@@ -76,7 +76,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Simulation-based calibration of the engines.")
     parser.add_argument("--engine", nargs="+", choices=SETTINGS, default=list(SETTINGS))
     parser.add_argument("--case", nargs="+", choices=CASES, default=list(MODELS))
-    parser.add_argument("--runs", type=int, default=300)
+    parser.add_argument("--runs", type=int, default=200)
     parser.add_argument("--seconds", type=float, default=float("inf"))
     parser.add_argument("--write", action="store_true")
     parser.add_argument("--table", action="store_true")

@@ -50,10 +50,10 @@ def network(slots: int = 50) -> Case:
     return from_prior(multi_access, data)
 
 
-def channel(links: int = 10) -> Case:
-    """A room whose material, noise and phase errors are unknown: 4 paths, 16 tones over 400 MHz, about 10 dB."""
+def channel(links: int = 6) -> Case:
+    """A room whose material, noise and phase errors are unknown: 3 paths, 16 tones over 400 MHz, about 10 dB."""
     data = {
-        "paths": room_paths(links, 4),
+        "paths": room_paths(links, 3),
         "subcarrier_frequency": 25.0e6 * (np.arange(16) - 7.5),
         "noise_power": 1e-7,
         "law": "half_space",
