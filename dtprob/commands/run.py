@@ -1,6 +1,5 @@
 """What the commands that run a CASE share: the session, the overrides, the fit with its checkpoint."""
 
-import os
 import warnings
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
@@ -12,6 +11,7 @@ import jax
 
 from dtprob import __version__
 from dtprob.case import Case, EngineSection
+from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.errors import InputError
 from dtprob.files import atomic_write
@@ -37,18 +37,10 @@ class Run:
     say: Say
 
 
-def _cache_folder() -> Path:
-    """Where compiled programs are kept between commands; JAX_COMPILATION_CACHE_DIR says otherwise."""
-    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(home) / "dtprob" / "compiled"
-
-
 def configure() -> None:
     """Double precision, and compiled programs kept between commands."""
     jax.config.update("jax_enable_x64", True)
-    if jax.config.jax_compilation_cache_dir is None:
-        jax.config.update("jax_compilation_cache_dir", str(_cache_folder()))
-        jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+    keep_compiled()
 
 
 @contextmanager

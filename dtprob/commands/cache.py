@@ -1,0 +1,56 @@
+"""Compiled programs kept between commands, so that the second run on data of the same shapes compiles nothing."""
+
+import hashlib
+import os
+import platform
+from pathlib import Path
+from typing import Final
+
+import jax
+
+LARGEST: Final = 1 << 30
+"""Bytes that the folder may hold at the start of a command; the oldest programs go first."""
+_WORTH_KEEPING: Final = 0.05
+"""Seconds of compilation from which a program is kept: reading one back takes a tenth of that."""
+
+
+def keep_compiled() -> None:
+    """Keep compiled programs in the user's cache folder; JAX_COMPILATION_CACHE_DIR names another one."""
+    if jax.config.jax_compilation_cache_dir is not None:
+        return
+    folder = cache_folder()
+    prune(folder, LARGEST)
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
+
+
+def cache_folder() -> Path:
+    """A folder of this kind of processor: a home directory may be shared with machines that lack its instructions."""
+    home = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(home) / "dtprob" / "compiled" / hashlib.sha256(_processor().encode()).hexdigest()[:12]
+
+
+def prune(folder: Path, largest: int) -> None:
+    """Delete the oldest files of a folder until the others take at most so many bytes."""
+    if not folder.is_dir():
+        return
+    files = sorted(
+        ((entry.stat(), entry.path) for entry in os.scandir(folder) if entry.is_file()),
+        key=lambda found: found[0].st_mtime,
+    )
+    total = sum(stat.st_size for stat, _ in files)
+    for stat, path in files:
+        if total <= largest:
+            return
+        Path(path).unlink(missing_ok=True)  # another process may prune too
+        total -= stat.st_size
+
+
+def _processor() -> str:
+    """The processor's instructions where the system tells them, else its name."""
+    try:
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        lines = []
+    flags = next((line for line in lines if line.lower().startswith(("flags", "features"))), "")
+    return f"{platform.machine()} {platform.processor()} {flags}"

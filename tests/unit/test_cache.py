@@ -1,0 +1,27 @@
+"""Compiled programs are kept where the user's cache lies, and the oldest go when there are too many."""
+
+import os
+
+from dtprob.commands import cache
+
+
+def test_the_oldest_programs_go_first(tmp_path):
+    for age, name in enumerate(["new", "middle", "old"]):
+        (tmp_path / name).write_bytes(bytes(100))
+        os.utime(tmp_path / name, (1e9 - age, 1e9 - age))
+    cache.prune(tmp_path, 250)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["middle", "new"]
+    cache.prune(tmp_path, 250)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["middle", "new"]
+
+
+def test_a_folder_that_is_not_there_yet_is_no_error(tmp_path):
+    cache.prune(tmp_path / "none", 0)
+
+
+def test_the_folder_follows_the_user_and_the_processor(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    here = cache.cache_folder()
+    assert here.is_relative_to(tmp_path / "dtprob")
+    monkeypatch.setattr(cache, "_processor", lambda: "another one")
+    assert cache.cache_folder() != here
