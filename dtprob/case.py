@@ -170,13 +170,21 @@ def load_case(path: str | os.PathLike[str]) -> Case:
             missing key, a value of the wrong type or out of range.
     """
     path = Path(path)
+    return parse_case(read_document(path), path)
+
+
+def read_document(path: Path) -> dict[str, Any]:
+    """The sections of a TOML file.
+
+    Raises:
+        InputError: no such file, or not TOML.
+    """
     if not path.is_file():
         raise InputError(str(path), "a CASE file (TOML)", "no such file", "Check the name and the folder")
     try:
-        document = tomllib.loads(path.read_text(encoding="utf-8"))
+        return tomllib.loads(path.read_text(encoding="utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(str(path), "a TOML file", str(error), "Correct the file there") from None
-    return parse_case(document, path)
 
 
 def parse_case(document: Mapping[str, Any], path: Path) -> Case:
@@ -189,21 +197,34 @@ def parse_case(document: Mapping[str, Any], path: Path) -> Case:
     Raises:
         InputError: as ``load_case``.
     """
-    sections: dict[str, Any] = {}
-    for name, content in document.items():
-        if name not in _SECTIONS:
-            raise unknown_name(path.name, name, _SECTIONS, "section")
-        if not isinstance(content, Mapping):
-            raise InputError(
-                f"{path.name} {name}", f"a section [{name}]", _shown(content), "Write it as a section"
-            )
-        sections[name] = _section(
-            cast("Mapping[str, Any]", content), _SECTIONS[name], f"{path.name} [{name}]"
-        )
+    sections = parse_sections(document, path, _SECTIONS)
     for name, key in (("model", "name"), ("data", "file")):
         if name not in sections:
             raise InputError(path.name, f"a section [{name}]", "none", f"Add [{name}] with at least '{key}'")
     return _resolved(Case(path=path.absolute(), **sections))
+
+
+def parse_sections(document: Mapping[str, Any], path: Path, kinds: Mapping[str, type]) -> dict[str, Any]:
+    """Check the sections of a TOML file.
+
+    Args:
+        document: the sections as TOML gives them.
+        path: where it came from.
+        kinds: for each section that can be, the dataclass that it is to become.
+
+    Raises:
+        InputError: an unknown section or key, a missing key, or a value of the wrong type or out of range.
+    """
+    sections: dict[str, Any] = {}
+    for name, content in document.items():
+        if name not in kinds:
+            raise unknown_name(path.name, name, kinds, "section")
+        if not isinstance(content, Mapping):
+            raise InputError(
+                f"{path.name} {name}", f"a section [{name}]", _shown(content), "Write it as a section"
+            )
+        sections[name] = _section(cast("Mapping[str, Any]", content), kinds[name], f"{path.name} [{name}]")
+    return sections
 
 
 def _section(content: Mapping[Any, Any], kind: type, where: str) -> Any:

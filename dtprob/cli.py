@@ -22,6 +22,7 @@ COMMANDS = {
     "demo": "dtprob.commands.demo",
     "fit": "dtprob.commands.fit",
     "diagnose": "dtprob.commands.diagnose",
+    "twin": "dtprob.commands.twin",
     "reproduce": "dtprob.commands.reproduce",
     "withheld": "dtprob.commands.withheld",
     "list": "dtprob.commands.listing",
@@ -72,6 +73,7 @@ def parser() -> Parser:
     _add_out(add("demo", "diagnose recorded measurements, without any set-up: report.html"))
     _add_case(add("fit", "infer a twin's parameters from data: posterior.nc, summary.json"))
     _add_case(add("diagnose", "find out why data differ from a twin: report.html, report.json, gap.nc"))
+    _add_twin(add("twin", "run a network's twin against its physical twin, phase after phase: history.json"))
     figure = add("reproduce", "make a figure of the seed report: FIGURE.json, FIGURE.png")
     figure.add_argument("figure", choices=tuple(FIGURES), metavar="FIGURE", help=", ".join(FIGURES))
     _add_out(figure)
@@ -98,6 +100,16 @@ def _add_case(added: argparse.ArgumentParser) -> None:
     added.add_argument("--seed", type=int, metavar="S", help="seed, instead of the case's")
     added.add_argument("--no-code", action="store_true", help="refuse a case that runs code of its own")
     added.add_argument("--resume", action="store_true", help="continue an interrupted run in the same DIR")
+
+
+def _add_twin(added: argparse.ArgumentParser) -> None:
+    parts = added.add_subparsers(metavar="STEP", dest="step", required=True)
+    run = parts.add_parser("run", help="collect, learn, control, monitor, diagnose, and collect again")
+    run.add_argument("twin_case", type=Path, metavar="CASE", help="TOML file of model and physical twin")
+    _add_out(run)
+    run.add_argument("--seed", type=int, metavar="S", help="seed, instead of the case's")
+    run.add_argument("--no-code", action="store_true", help="refuse a case that runs code of its own")
+    run.add_argument("--resume", action="store_true", help="continue an interrupted run in the same DIR")
 
 
 def _add_withheld(added: argparse.ArgumentParser) -> None:

@@ -5,6 +5,7 @@ the ground truth train and judge policies through the same code. PettingZoo is n
 `dtprob.control.pettingzoo`.
 """
 
+from dtprob.control.collection import collector
 from dtprob.control.coma import COMA
 from dtprob.control.environment import Environment, NetworkReward, Observation, Step
 from dtprob.control.information import Counts, DirichletInformation, SampledInformation
@@ -33,6 +34,7 @@ __all__ = [
     "TablePolicy",
     "Trained",
     "aloha",
+    "collector",
     "draw_pool",
     "evaluate",
     "tabulate",

@@ -17,6 +17,7 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from numpyro.distributions import Distribution, biject_to, constraints
 from numpyro.distributions.transforms import Transform
+from scipy import special
 
 from dtprob.errors import InputError
 
@@ -182,6 +183,25 @@ def log_draws(
     gamma = jax.random.loggamma(key, jnp.where(allowed, concentration, 1.0), shape)
     gamma = jnp.where(allowed, gamma, -jnp.inf)
     return gamma - jax.nn.logsumexp(gamma, axis=-1, keepdims=True)
+
+
+def log_marginal(
+    concentration: Float[np.ndarray, "*row outcome"], counts: Float[np.ndarray, "*batch_row outcome"]
+) -> Float[np.ndarray, "*batch_row"]:
+    """Log-probability of outcomes with these counts, in their order, where each row has a Dirichlet law of its own.
+
+    Args:
+        concentration: of each outcome; 0 where it cannot happen.
+        counts: how often each happened; -inf is the answer where one happened that cannot.
+    """
+    possible = concentration > 0
+    inside = np.where(possible, concentration, 1.0)
+    seen = np.where(possible, counts, 0.0)
+    each = special.gammaln(inside + seen) - special.gammaln(inside)
+    total, number = np.sum(np.where(possible, inside, 0.0), axis=-1), np.sum(seen, axis=-1)
+    value = np.sum(np.where(possible, each, 0.0), axis=-1)
+    value = value - (special.gammaln(total + number) - special.gammaln(total))
+    return np.where(np.any((counts > 0) & ~possible, axis=-1), -np.inf, value)
 
 
 def log_shares(

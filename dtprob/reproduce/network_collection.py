@@ -7,24 +7,13 @@ reward; it is a frame policy of 8 slots. It is judged on the real network.
 from collections.abc import Mapping, Sequence
 from typing import Final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PRNGKeyArray
 
-from dtprob.control import (
-    COMA,
-    Budget,
-    Counts,
-    DirichletInformation,
-    Environment,
-    FramePolicy,
-    TablePolicy,
-    draw_pool,
-    tabulate,
-    train,
-)
+from dtprob import control
+from dtprob.control import Budget, TablePolicy
 from dtprob.models.multi_access import Clusters, priors
 from dtprob.physical.multi_access import Network
 from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
@@ -38,7 +27,6 @@ CONCENTRATION: Final = 0.5
 TARGETS: Final = (0.4, 0.3, 0.25, 0.2)
 FRAME: Final = 8
 BUDGET: Final = Budget(400_000, 40, SLOTS)
-_DRAWS: Final = 1000
 
 
 def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
@@ -71,16 +59,17 @@ _MEASURE: Final = "error: total variation of the posterior mean from the truth, 
 def collector(key: PRNGKeyArray, budget: Budget) -> Float[np.ndarray, "phase device buffer arrival ack"]:
     """The table of a policy that is trained to learn as much as it can in an episode."""
     prior = priors(Clusters(NETWORK.clusters), CONCENTRATION)
-    known = Counts(*(jnp.asarray(prior[name]) for name in ("log_arrival", "log_reception")))
     nothing = {name: np.zeros_like(table) for name, table in prior.items()}
-    first, second, third = jax.random.split(key, 3)
-    pool = draw_pool(first, law(nothing, CONCENTRATION), _DRAWS)
-    reward = DirichletInformation(known, NETWORK.clusters)
-    environment = Environment(TWIN, pool, SLOTS, reward=reward)
-    learner = COMA(scale=1.0, discount=0.98, frame=FRAME)
-    start = FramePolicy(second, NETWORK.devices, FRAME)
-    policy = eqx.filter_jit(train)(third, learner, start, environment, budget).policy
-    return np.asarray(tabulate(policy).probability)
+    policy, _ = control.collector(
+        key,
+        TWIN,
+        law(nothing, CONCENTRATION),
+        clusters=NETWORK.clusters,
+        slots=SLOTS,
+        frame=FRAME,
+        budget=budget,
+    )
+    return np.asarray(policy.probability)
 
 
 def directed(

@@ -49,13 +49,8 @@ class Watch:
     @property
     def factors(self) -> dict[str, float]:
         """Probability of each factor to be the one that changed, up to the alarm or the end."""
-        last = self.detected
-        paths = {
-            name: statistics.detector(e)[-1 if last is None else last] for name, e in self.evidence.items()
-        }
-        top = max(paths.values())
-        weight = {name: float(np.exp(value - top)) for name, value in paths.items()}
-        return {name: value / sum(weight.values()) for name, value in weight.items()}
+        until = None if self.detected is None else self.detected + 1
+        return statistics.blame({name: each[:until] for name, each in self.evidence.items()})
 
     @property
     def changed(self) -> str | None:

@@ -100,6 +100,14 @@ def mixed(evidence: Mapping[str, Float[np.ndarray, " window"]]) -> Float[np.ndar
     return special.logsumexp(stacked, axis=0) - np.log(len(stacked))
 
 
+def blame(evidence: Mapping[str, Float[np.ndarray, " window"]]) -> dict[str, float]:
+    """Probability of each factor to be the one that changed, by each one's own detector in the last window."""
+    paths = {name: float(detector(each)[-1]) for name, each in evidence.items()}
+    top = max(paths.values())
+    weight = {name: float(np.exp(value - top)) for name, value in paths.items()}
+    return {name: value / sum(weight.values()) for name, value in weight.items()}
+
+
 def roc(
     statistic: Float[np.ndarray, " window"],
     normal: Float[np.ndarray, " window"],

@@ -76,6 +76,25 @@ class Network:
         with np.errstate(divide="ignore"):
             return {"log_arrival": np.log(self.arrival), "log_reception": np.log(self.reception)}
 
+    def without(self, device: int) -> Self:
+        """The same network with a device that generates no packets any more.
+
+        Raises:
+            InputError: no such device.
+        """
+        number = next((i for i, cluster in enumerate(self.clusters) if device in cluster), None)
+        if number is None:
+            expected = f"one of 0 to {self.devices - 1}"
+            raise InputError("device", expected, str(device), "Name a device of the network")
+        cluster = self.clusters[number]
+        digit = 2 ** (len(cluster) - 1 - cluster.index(device))
+        outcome = np.arange(self.arrival.shape[-1])
+        arrival = self.arrival.copy()
+        silent, with_it = arrival[number], (outcome & digit) > 0
+        silent[:, outcome[with_it] - digit] += silent[:, with_it]
+        silent[:, with_it] = 0.0
+        return type(self)(self.clusters, self.capacity, arrival, self.reception)
+
     @classmethod
     def reference(cls) -> Self:
         """Four devices in two clusters, one packet each: the system of the seed report."""
