@@ -13,6 +13,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "prediction": "dtprob.reproduce.prediction",
     "fig6a": "dtprob.reproduce.fig6a",
     "fig6b": "dtprob.reproduce.fig6b",
+    "fig7": "dtprob.reproduce.fig7",
     "fig9": "dtprob.reproduce.fig9",
     "fig10": "dtprob.reproduce.fig10",
     "fig10_learned": "dtprob.reproduce.fig10_learned",

@@ -17,7 +17,15 @@ from dtprob.physical.channel import Sounding, array_responses, path_channels, su
 from dtprob.physical.rays import Rays
 from dtprob.physical.tracing import scene_materials, trace
 from dtprob.physical.world import SPEED_OF_LIGHT, Material, World, planar_array
-from dtprob.raytracing.calibration import SCHEMES, Settings, Statistics, calibrate_runs, project
+from dtprob.raytracing.calibration import (
+    SCHEMES,
+    Calibration,
+    Scheme,
+    Settings,
+    Statistics,
+    calibrate_runs,
+    project,
+)
 from dtprob.raytracing.field import path_gain
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.trace import load_scene
@@ -67,10 +75,9 @@ class Truth(NamedTuple):
     world: World
     rays: Rays
 
-    @property
-    def noise_power(self) -> float:
-        """Of the noise per coefficient at `SNR_DB`: the sum over paths of |a_p|^2 over the ratio."""
-        return float(np.sum(np.abs(self.rays.gain) ** 2)) / 10 ** (SNR_DB / 10)
+    def noise_power(self, ratio_db: float) -> float:
+        """Of the noise per coefficient: the sum over paths of |a_p|^2 over the ratio."""
+        return float(np.sum(np.abs(self.rays.gain) ** 2)) / 10 ** (ratio_db / 10)
 
 
 class Twin(NamedTuple):
@@ -166,30 +173,73 @@ def statistics(twin: Twin, channel: Complex[np.ndarray, "snapshot entry"], side:
     )
 
 
-def errors(runs: Sequence[Statistics], noise_power: float) -> dict[str, Float[np.ndarray, " run"]]:
+def measured(
+    key: PRNGKeyArray, run: int, concentration: float, ratio_db: float = SNR_DB, side: int = SIDE
+) -> Statistics:
+    """Statistics of one run's measurements, whose paths have von Mises errors of this concentration on their phases.
+
+    Noise and the quantiles of the errors depend on the run alone: points of a curve differ by what the curve shows.
+    """
+    truth, twin = scene()
+    random = generator(key, run)
+    angles = von_mises(random.random((SNAPSHOTS, truth.rays.mask.shape[1])), concentration)
+    channel = turned(truth, angles, side)
+    channel += np.float32(np.sqrt(truth.noise_power(ratio_db))) * white(random, channel.shape)
+    return statistics(twin, channel, side)
+
+
+def calibrations(runs: Sequence[Statistics], ratio_db: float = SNR_DB) -> dict[Scheme, Calibration]:
+    """Every scheme's calibration of every run."""
+    truth, twin = scene()
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runs)
+    noise_power = jnp.full(len(runs), truth.noise_power(ratio_db))
+    return {
+        scheme: calibrate_runs(
+            twin.calibration, stacked, noise_power, settings=Settings(scheme, law="half_space")
+        )
+        for scheme in SCHEMES
+    }
+
+
+def errors(runs: Sequence[Statistics], ratio_db: float = SNR_DB) -> dict[str, Float[np.ndarray, " run"]]:
     """Relative error of the power sum_p |a_p|^2, mean over the test receivers, after each scheme, by run.
 
     The true power is that of the twin's paths with the true material, so that the material alone makes errors.
     """
     _, twin = scene()
-    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *runs)
-    n = twin.tests.n_object
-    right = _power(twin.tests, jnp.full((1, n), TRUE.permittivity), jnp.full((1, n), TRUE.conductivity))
-    found: dict[str, np.ndarray] = {}
-    for scheme in SCHEMES:
-        settings = Settings(scheme, law="half_space")
-        result = calibrate_runs(
-            twin.calibration, stacked, jnp.full(len(runs), noise_power), settings=settings
-        )
-        power = _power(twin.tests, result.permittivity, result.conductivity)
-        found[scheme] = np.asarray(jnp.mean(jnp.abs(power / right - 1), axis=1))
-    return found
+    right = power(twin.tests, *true_materials(twin.tests))
+    return {
+        scheme: np.mean(np.abs(power(twin.tests, found.permittivity, found.conductivity) / right - 1), axis=1)
+        for scheme, found in calibrations(runs, ratio_db).items()
+    }
+
+
+def true_materials(paths: PathSet) -> tuple[Float[jax.Array, "1 object"], Float[jax.Array, "1 object"]]:
+    """Permittivity and conductivity of the truth, as of one run."""
+    shape = 1, paths.n_object
+    return jnp.full(shape, TRUE.permittivity), jnp.full(shape, TRUE.conductivity)
+
+
+def power(
+    paths: PathSet, permittivity: Float[jax.Array, "run object"], conductivity: Float[jax.Array, "run object"]
+) -> Float[np.ndarray, "run link"]:
+    """Sum over paths of |a_p|^2."""
+    return np.asarray(_power(paths, permittivity, conductivity))
 
 
 @jax.jit
-def _power(
-    paths: PathSet, permittivity: Float[jax.Array, "run object"], conductivity: Float[jax.Array, "run object"]
-) -> Float[jax.Array, "run link"]:
-    """Sum over paths of |a_p|^2."""
-    gain = jax.vmap(lambda e, s: path_gain(paths, e, s, law="half_space"))(permittivity, conductivity)
-    return jnp.sum(jnp.abs(gain) ** 2, axis=2)
+def _power(paths: PathSet, permittivity: jax.Array, conductivity: jax.Array) -> jax.Array:
+    def one(materials: tuple[jax.Array, jax.Array]) -> jax.Array:
+        return jnp.sum(jnp.abs(path_gain(paths, *materials, law="half_space")) ** 2, axis=1)
+
+    return jax.lax.map(one, (permittivity, conductivity))
+
+
+def von_mises(probability: Float[np.ndarray, "*n"], concentration: float) -> Float[np.ndarray, "*n"]:
+    """Quantiles of a von Mises distribution about zero, rad; an infinite concentration has no spread."""
+    if np.isinf(concentration):
+        return np.zeros_like(probability)
+    grid = np.linspace(-np.pi, np.pi, 4097)
+    density = np.exp(concentration * (np.cos(grid) - 1))
+    steps = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2)])
+    return np.interp(probability, steps / steps[-1], grid)

@@ -56,6 +56,6 @@ def _cell(key: PRNGKeyArray, runs: int, wavelengths: float) -> dict[str, Float[n
         direction = random.standard_normal((urban.SNAPSHOTS, 3))
         direction /= np.linalg.norm(direction, axis=1, keepdims=True)
         channel = urban.displaced(truth, size * direction)
-        channel += np.float32(np.sqrt(truth.noise_power)) * urban.white(random, channel.shape)
+        channel += np.float32(np.sqrt(truth.noise_power(urban.SNR_DB))) * urban.white(random, channel.shape)
         found.append(urban.statistics(twin, channel))
-    return urban.errors(found, truth.noise_power)
+    return urban.errors(found)

@@ -71,19 +71,8 @@ class Study:
         return self._progress.part(name, lambda: self._measured(concentration, ratio_db, side))
 
     def _measured(self, concentration: float, ratio_db: float, side: int) -> Errors:
-        truth, twin = urban.scene()
-        noise_power = truth.noise_power * 10 ** ((urban.SNR_DB - ratio_db) / 10)
-        scale = np.float32(np.sqrt(noise_power))
-        found = []
-        for run in range(self._runs):
-            random = urban.generator(self._key, run)
-            shape = urban.SNAPSHOTS, truth.rays.mask.shape[1]
-            # quantiles of one draw at every concentration: the points of a curve differ by it alone
-            angles = von_mises(random.random(shape), concentration)
-            channel = urban.turned(truth, angles, side)
-            channel += scale * urban.white(random, channel.shape)
-            found.append(urban.statistics(twin, channel, side))
-        return urban.errors(found, noise_power)
+        runs = [urban.measured(self._key, run, concentration, ratio_db, side) for run in range(self._runs)]
+        return urban.errors(runs, ratio_db)
 
     def _panel(
         self, title: str, x: Quantity, at: Sequence[float], cells: Sequence[Callable[[], Errors]]
@@ -94,15 +83,3 @@ class Study:
             for scheme in SCHEMES
         ]
         return Panel(title, x, ERROR, tuple(series))
-
-
-def von_mises(probability: Float[np.ndarray, "*n"], concentration: float) -> Float[np.ndarray, "*n"]:
-    """Quantiles of a von Mises distribution about zero, rad; an infinite concentration has no spread."""
-    if np.isinf(concentration):
-        return np.zeros_like(probability)
-    if concentration == 0:
-        return np.pi * (2 * probability - 1)
-    grid = np.linspace(-np.pi, np.pi, 4097)
-    density = np.exp(concentration * (np.cos(grid) - 1))
-    steps = np.concatenate([[0.0], np.cumsum((density[1:] + density[:-1]) / 2)])
-    return np.interp(probability, steps / steps[-1], grid)
