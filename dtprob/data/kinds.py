@@ -51,6 +51,8 @@ LABEL_ARRAYS: Mapping[str, ArraySpec] = {
     "y": ArraySpec((("sample",),), required=True),
     "labelled": ArraySpec((("sample",),), "integer", required=True),
     "prediction": ArraySpec((("sample",),)),
+    "weight": ArraySpec((("sample",),), lower=0.0),
+    "context": ArraySpec((("sample",),), "integer", lower=0),
 }
 
 
@@ -190,15 +192,20 @@ class Labels(_Checked):
         y: label, 0 where there is none.
         labelled: where ``y`` is a label.
         prediction: the predictor's label.
+        weight: how much a sample counts in what is estimated.
+        context: which context a sample belongs to, 0, 1, ...
 
     Raises:
-        InputError: arrays that do not fit together, NaN or infinity, no label at all.
+        InputError: arrays that do not fit together, NaN or infinity, a weight or context below 0, no label at
+            all.
     """
 
     x: Float[np.ndarray, "sample feature"]
     y: Float[np.ndarray, " sample"]
     labelled: Bool[np.ndarray, " sample"]
     prediction: Float[np.ndarray, " sample"] | None = None
+    weight: Float[np.ndarray, " sample"] | None = None
+    context: Int[np.ndarray, " sample"] | None = None
 
     def __post_init__(self) -> None:
         self._check(LABEL_ARRAYS)

@@ -153,18 +153,18 @@ def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
                 "x", f"columns x_0 to x_{len(numbered) - 1}", ", ".join(numbered), "Number them from 0"
             )
         arrays["x"] = np.stack([arrays.pop(name) for name in numbered], axis=1)
+    optional = ("prediction", "weight", "context")
     for name in arrays:
-        if name not in {"x", "y", "prediction"}:
-            raise unknown_name("array", name, ["x", "y", "prediction"], "array name")
+        if name not in {"x", "y", *optional}:
+            raise unknown_name("array", name, ["x", "y", *optional], "array name")
     arrays = _canonical(arrays, LABEL_ARRAYS, matlab=matlab)
     if arrays["x"].ndim == 1:
         arrays["x"] = arrays["x"][:, None]
     _numeric("y", arrays["y"])
     y = np.asarray(arrays["y"], dtype=float)
     labelled = ~np.isnan(y)
-    return Labels(
-        x=arrays["x"], y=np.where(labelled, y, 0.0), labelled=labelled, prediction=arrays.get("prediction")
-    )
+    others = {name: arrays.get(name) for name in optional}
+    return Labels(x=arrays["x"], y=np.where(labelled, y, 0.0), labelled=labelled, **others)
 
 
 def _canonical(arrays: Arrays, specs: Mapping[str, ArraySpec], *, matlab: bool) -> Arrays:

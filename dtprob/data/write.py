@@ -63,7 +63,8 @@ def file_arrays(data: Data) -> dict[str, np.ndarray]:
     if isinstance(data, Labels):
         columns = {f"x_{i}": column for i, column in enumerate(data.x.T)}
         columns["y"] = np.where(data.labelled, data.y, np.nan)
-        return columns if data.prediction is None else {**columns, "prediction": data.prediction}
+        others = {"prediction": data.prediction, "weight": data.weight, "context": data.context}
+        return columns | {name: values for name, values in others.items() if values is not None}
     return arrays
 
 

@@ -14,9 +14,9 @@ import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Float
 
+from dtprob.data import Labels
 from dtprob.errors import InputError
 from dtprob.models.declaration import model
-from dtprob.models.scene import site
 
 
 @model(axes={"predicted_label": ("sample",), "label_deviation": ("sample",)}, cluster="sample")
@@ -39,18 +39,18 @@ def label_twin(
     del x
     unit = jnp.maximum(jnp.std(prediction), 1e-12)
     deviation: Any = numpyro.sample("error_deviation", dist.LogNormal(jnp.log(unit) - 1.0, 1.5))
-    predicted = site("predicted_label", prediction)
-    spread = site("label_deviation", jnp.broadcast_to(deviation, prediction.shape))
+    predicted: Any = numpyro.deterministic("predicted_label", prediction)
+    spread: Any = numpyro.deterministic("label_deviation", jnp.broadcast_to(deviation, prediction.shape))
     with numpyro.plate("sample", prediction.shape[0]):
         numpyro.sample("y", dist.Normal(predicted, spread), obs=y)
     return predicted
 
 
-def labelled_rows(data: Any) -> dict[str, Any]:
-    """The rows with a label, as arguments of the model.
+def labelled_rows(data: Labels) -> dict[str, Any]:
+    """The rows with a label, as arguments of the model; each counts alike, whatever its weight.
 
     Args:
-        data: `dtprob.data.Labels`.
+        data: checked rows.
 
     Raises:
         InputError: there is no prediction to compare labels with.

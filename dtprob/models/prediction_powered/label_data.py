@@ -1,12 +1,12 @@
 """From a file of labels to the arguments of the `prediction_powered` model, for a CASE."""
 
 import warnings
-from collections.abc import Generator
+from collections.abc import Generator, Mapping
 from typing import Any, Final
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dtprob.data import Labels
 from dtprob.errors import InputError, unknown_name
@@ -49,32 +49,31 @@ def label_data(
         scheme: one of the six.
         predictor: "ridge" or "neighbours", where the file has no prediction.
         folds: of the labelled rows, where predictors are trained.
-        by: one lambda "overall", or one per "parameter".
+        by: one lambda "overall", one per "parameter", or one per "context", a column of the file.
         calibration: as in `posterior_data`.
         intercept: whether a regression has a constant besides the features.
         level: of the intervals that the posterior's width is calibrated for.
         seed: of folds and splits.
 
     Raises:
-        InputError: an unknown name, labels that the loss does not allow, fewer labels than folds, training
-            labels of one class.
+        InputError: an unknown name, no contexts to tune by, labels that the loss does not allow, fewer labels
+            than folds, training labels of one class.
     """
     chosen = named_loss(loss)
     _check_labels(data, loss)
+    if by == "context" and data.context is None:
+        remedy = "Add a column context with whole numbers from 0, or tune overall"
+        raise InputError("labels", "a context of each row, to tune by context", "none", remedy)
     if predictor not in PREDICTORS:
         raise unknown_name("predictor", predictor, PREDICTORS, "predictor")
     mine, rest = np.flatnonzero(data.labelled), np.flatnonzero(~data.labelled)
     design = np.column_stack([np.ones(len(data.x)), data.x]) if intercept else data.x
-    features: dict[str, Any] = {} if loss == "mean" else {"x": design[mine], "x_unlabelled": design[rest]}
+    features = None if loss == "mean" else design
+    given: dict[str, Any] = {"weight": data.weight, "context": data.context}
     y = data.y[mine]
-    if not len(rest):
-        sample = Sample(y=y, x=features.get("x"))
-    elif data.prediction is not None:
-        predicted: dict[str, Any] = {
-            "prediction": data.prediction[mine],
-            "prediction_unlabelled": data.prediction[rest],
-        }
-        sample = Sample(y=y, **features, **predicted)
+    if not len(rest) or data.prediction is not None:
+        given |= {"x": features, "prediction": data.prediction}
+        sample = Sample(y=y, **_split(given, mine, rest))
     else:
         sample = train(
             jax.random.key(seed),
@@ -84,14 +83,23 @@ def label_data(
             y=y,
             x_unlabelled=data.x[rest],
             folds=folds,
-            features=features.get("x"),
-            features_unlabelled=features.get("x_unlabelled"),
+            **_split(given | {"features": features}, mine, rest),
             probability=loss == "logistic",
         )
     found = estimate(chosen, sample, scheme, by=by, level=level)
     for sentence in (*worth(found).warnings, *_biases(data, sample)):
         warnings.warn(sentence, stacklevel=2)
     return posterior_data(chosen, sample, found, calibration=calibration)
+
+
+def _split(
+    columns: Mapping[str, np.ndarray | None], mine: Int[np.ndarray, " n"], rest: Int[np.ndarray, " N"]
+) -> dict[str, Any]:
+    """The columns that there are, of labelled and, where there are any, of unlabelled rows."""
+    there = {name: column for name, column in columns.items() if column is not None}
+    own = {name: column[mine] for name, column in there.items()}
+    other = {f"{name}_unlabelled": column[rest] for name, column in there.items()}
+    return own | other if len(rest) else own
 
 
 def _check_labels(data: Labels, loss: str) -> None:

@@ -134,7 +134,12 @@ def test_written_logs_and_labels_come_back(tmp_path, suffix):
     write(tmp_path / f"again{suffix}", log)
     assert_same(read(tmp_path / f"again{suffix}"), log)
     labels = Labels(
-        x=np.arange(8.0).reshape(4, 2), y=[1, 2, 0, 0], labelled=[1, 1, 0, 0], prediction=[1, 2, 3, 4]
+        x=np.arange(8.0).reshape(4, 2),
+        y=[1, 2, 0, 0],
+        labelled=[1, 1, 0, 0],
+        prediction=[1, 2, 3, 4],
+        weight=[1, 0.5, 0, 2],
+        context=[0, 1, 1, 0],
     )
     write(tmp_path / f"labels{suffix}", labels)
     assert_same(read(tmp_path / f"labels{suffix}"), labels)

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from dtprob.case import load_case
+from dtprob.cli import main
 from dtprob.data import Labels
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.label_data import label_data
@@ -18,7 +19,7 @@ from dtprob.workflow.summary import summarise
 EXAMPLE = Path(__file__).parents[3] / "examples" / "labels"
 
 
-def rows(n=40, count=300, *, kind="linear", quality=1.0, predicted=True):
+def rows(n=40, count=300, *, kind="linear", quality=1.0, predicted=True, **columns):
     random = np.random.default_rng(5)
     x = random.standard_normal((n + count, 1))
     signal = 2 * x[:, 0]
@@ -27,9 +28,8 @@ def rows(n=40, count=300, *, kind="linear", quality=1.0, predicted=True):
         y = (y > 0).astype(float)
     guess = quality * signal + 0.5 * random.standard_normal(n + count)
     labelled = np.arange(n + count) < n
-    return Labels(
-        x=x, y=np.where(labelled, y, 0.0), labelled=labelled, prediction=guess if predicted else None
-    )
+    prediction = guess if predicted else None
+    return Labels(x=x, y=np.where(labelled, y, 0.0), labelled=labelled, prediction=prediction, **columns)
 
 
 def example(folder, options=""):
@@ -107,6 +107,8 @@ def test_a_scale_that_is_off_is_said():
         (rows(), {"predictor": "forest"}, "forest"),
         (rows(), {"scheme": "cpi"}, "cpi"),
         (rows(), {"calibration": "full"}, "calibration: expected matrix, scalar or none"),
+        (rows(), {"by": "contex"}, "by: expected one of the choices .* Did you mean 'context'"),
+        (rows(), {"by": "context"}, "labels: expected a context of each row, to tune by context"),
     ],
 )
 def test_what_cannot_be_is_one_clear_line(data, options, message):
@@ -122,3 +124,120 @@ def test_training_labels_of_one_class_are_refused():
     alike = Labels(x=data.x, y=y, labelled=data.labelled)
     with pytest.raises(InputError, match=r"training labels of fold \d: expected both classes, got only 0"):
         label_data(alike, loss="logistic")
+
+
+def test_weights_count_rows_as_often_as_they_say():
+    weight = np.where(np.arange(340) % 3 == 0, 2.0, 1.0)
+    data = rows(weight=weight)
+    twice = np.repeat(np.arange(340), weight.astype(int))
+    again = Labels(
+        x=data.x[twice], y=data.y[twice], labelled=data.labelled[twice], prediction=data.prediction[twice]
+    )
+    found, copied = (said(lambda d=d: label_data(d, loss="ols", scheme="ppi"))[0] for d in (data, again))
+    np.testing.assert_allclose(found["center"], copied["center"], rtol=1e-9)
+    plain = said(lambda: label_data(rows(), loss="ols", scheme="ppi"))[0]
+    assert not np.allclose(found["center"], plain["center"], rtol=1e-3)
+
+
+def test_each_context_of_a_file_has_a_lambda():
+    data = rows(context=np.arange(340) % 2)
+    found, _ = said(lambda: label_data(data, loss="mean", by="context"))
+    overall, _ = said(lambda: label_data(data, loss="mean"))
+    assert float(found["center"][0]) != float(overall["center"][0])
+
+
+def table(data):
+    """The columns of a file of labels."""
+    columns = {"x_0": data.x[:, 0], "y": np.where(data.labelled, data.y, np.nan)}
+    return columns if data.prediction is None else columns | {"prediction": data.prediction}
+
+
+def changed(name, index, value):
+    columns = table(rows())
+    columns[name] = columns.get(name, np.ones(340)).copy()
+    columns[name][index] = value
+    return columns
+
+
+WRONG_FILES = {
+    "fewer labels than folds": (
+        table(rows(n=3, predicted=False)),
+        "mean",
+        "labelled samples: expected at least one per fold (5), got 3. Use 3 folds or fewer",
+    ),
+    "one class in a fold": (
+        table(rows(predicted=False)) | {"y": np.where(np.arange(340) < 40, np.arange(340) == 0, np.nan)},
+        "logistic",
+        "expected both classes, got only 0. Use fewer folds",
+    ),
+    "no label": (changed("y", slice(None), np.nan), "mean", "y: expected at least one label, got none"),
+    "infinite label": (
+        changed("y", 7, np.inf),
+        "mean",
+        "y: expected finite numbers, got infinity at index 7",
+    ),
+    "a feature missing": (
+        changed("x_0", 5, np.nan),
+        "ols",
+        "x: expected finite numbers, got NaN at index (5, 0)",
+    ),
+    "features of other names": (
+        table(rows()) | {"x_2": np.ones(340)},
+        "ols",
+        "x: expected columns x_0 to x_1, got x_0, x_2. Number them from 0",
+    ),
+    "negative weight": (changed("weight", 4, -1.0), "mean", "weight: expected values from 0 up, got -1"),
+    "no weight at a label": (
+        table(rows()) | {"weight": np.where(np.arange(340) < 40, 0.0, 1.0)},
+        "mean",
+        "weight: expected a weight above 0, got zeros only",
+    ),
+    "misspelt column": (
+        table(rows()) | {"weigth": np.ones(340)},
+        "mean",
+        "Did you mean 'weight'?",
+    ),
+}
+
+
+def case_of(folder, columns, loss):
+    np.savetxt(
+        folder / "labels.csv",
+        np.column_stack(list(columns.values())),
+        delimiter=",",
+        header=",".join(columns),
+        comments="",
+    )
+    file = folder / "case.toml"
+    file.write_text(
+        f"""[model]
+name = "prediction_powered"
+[model.options]
+loss = "{loss}"
+[data]
+file = "labels.csv"
+[engine]
+name = "laplace"
+"""
+    )
+    return file
+
+
+@pytest.mark.parametrize("mistake", WRONG_FILES)
+def test_fit_answers_a_wrong_file_in_one_line(mistake, tmp_path, capsys):
+    columns, loss, message = WRONG_FILES[mistake]
+    file = case_of(tmp_path, columns, loss)
+    assert main(["fit", str(file), "--out", str(tmp_path / "out")]) == 2
+    text = capsys.readouterr().err
+    assert message in text
+    assert text.startswith("dtprob: ")
+    assert text.count("\n") == 1
+
+
+def test_fit_says_that_it_is_erm_without_unlabelled_rows(tmp_path, capsys):
+    file = case_of(tmp_path, table(rows(count=0)), "mean")
+    with warnings.catch_warnings():
+        warnings.simplefilter("always")
+        assert main(["fit", str(file), "--out", str(tmp_path / "out")]) == 0
+    told = capsys.readouterr()
+    assert "There are no unlabelled samples with predictions, so this is plain ERM." in told.out + told.err
