@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from scipy import stats
 
+from dtprob.models.prediction_powered.arrays import Values
 from dtprob.models.prediction_powered.covariance import spread
 from dtprob.models.prediction_powered.moments import Evaluation, Group
 from dtprob.models.prediction_powered.schemes import Mix
@@ -150,7 +151,7 @@ def evaluation_of(study: LabelStudy, count: Float[Array, ""]) -> Evaluation:
     )
 
 
-def _estimate(evaluation: Evaluation, lam: Array, practice: Practice) -> tuple[Array, Array, Array]:
+def _estimate(evaluation: Evaluation, lam: Values, practice: Practice) -> tuple[Values, Values, Values]:
     """Estimate, standard error and degrees of freedom."""
     correction = evaluation.unlabelled.gradient[0] - evaluation.predicted.gradient[0]
     point = -(evaluation.labelled.gradient[0] + lam[0] * correction)

@@ -7,22 +7,23 @@ losses (Davidson and MacKinnon, Bootstrap testing in nonlinear models, 1999). Pr
 and lambda is kept, as in PPBoot (Zrnic, 2024).
 """
 
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 from dataclasses import replace
-from typing import Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Float, Int, PRNGKeyArray
+from scipy import linalg
 
 from dtprob.errors import InputError
+from dtprob.models.prediction_powered.arrays import Values
 from dtprob.models.prediction_powered.losses import AbstractLoss, named_loss
-from dtprob.models.prediction_powered.moments import Group, evaluate, group_sums, labelled_rows
+from dtprob.models.prediction_powered.moments import Derivatives, Group, evaluate, group_sums, labelled_rows
 from dtprob.models.prediction_powered.quantile import Quantile, quantile_problem
 from dtprob.models.prediction_powered.result import Estimate
-from dtprob.models.prediction_powered.sample import Chunk, Sample
+from dtprob.models.prediction_powered.sample import Chunk, Sample, averaged
 from dtprob.models.prediction_powered.schemes import Mix
 
 _FEW: Final = 4096
@@ -34,8 +35,8 @@ type Method = Literal["percentile", "basic"]
 class Means(NamedTuple):
     """Mean gradient and second derivative of a group in each resample, per context."""
 
-    gradient: Float[Array, "draw context parameter"]
-    hessian: Float[Array, "draw context parameter parameter"]
+    gradient: Float[np.ndarray, "draw context parameter"]
+    hessian: Float[np.ndarray, "draw context parameter parameter"]
 
 
 def bootstrap(
@@ -78,104 +79,141 @@ def bootstrap_draws(
     key: PRNGKeyArray, loss: str | AbstractLoss | Quantile, sample: Sample, estimate: Estimate, draws: int
 ) -> Float[np.ndarray, "draw parameter"]:
     """The estimates of the resamples."""
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     if isinstance(loss, Quantile):
-        return _quantile_draws(key, loss, sample, estimate, draws)
-    chosen, theta = named_loss(loss), jnp.asarray(estimate.theta)
-    keys = jax.random.split(key)
+        return _quantile_draws(random, loss, sample, estimate, draws)
+    chosen = named_loss(loss)
+    theta = np.asarray(estimate.theta)
     true, predicted = labelled_rows(sample)
-    unlabelled = _unlabelled_means(keys[1], chosen, sample, theta, draws)
-
-    def estimates(counts: Array, means: Means) -> Array:
-        groups = (
-            _resampled(chosen, theta, true, counts, 1),
-            _resampled(chosen, theta, predicted, counts, sample.n_context),
-        )
-        return theta - _steps(_mix(sample, estimate), *groups, means)
-
-    return np.concatenate(
-        [
-            np.asarray(estimates(counts, Means(unlabelled.gradient[rows], unlabelled.hessian[rows])))
-            for rows, counts in _batches(keys[0], sample.n, len(theta), draws)
-        ]
-    )
+    mix, unlabelled = _mix(sample, estimate), _unlabelled_means(random, chosen, sample, theta, draws)
+    parts: list[np.ndarray] = []
+    for rows in _batches(sample.n, len(theta), draws):
+        groups = (true, 1), (predicted, sample.n_context)
+        own = _resampled(random, chosen, theta, groups, rows.stop - rows.start)
+        parts.append(theta - _steps(mix, own[0], own[1], Means(*(part[rows] for part in unlabelled))))
+    return np.concatenate(parts)
 
 
-def _batches(key: PRNGKeyArray, size: int, dimension: int, draws: int) -> Generator[tuple[slice, Array]]:
-    """Resamples of `size` things, a bounded amount at a time: which draws, and their counts."""
+def _batches(size: int, dimension: int, draws: int) -> Generator[slice]:
+    """Which resamples of `size` things are held at a time."""
     batch = max(1, _NUMBERS // (size * (dimension + 1)))
-    for number, start in enumerate(range(0, draws, batch)):
-        rows = slice(start, min(start + batch, draws))
-        yield rows, resample(jax.random.fold_in(key, number), size, rows.stop - rows.start)
+    for start in range(0, draws, batch):
+        yield slice(start, min(start + batch, draws))
 
 
-def resample(key: PRNGKeyArray, size: int, draws: int) -> Float[Array, "draw size"]:
-    """How often each of `size` things is in each of `draws` resamples."""
-    index = np.asarray(jax.random.randint(key, (draws, size), 0, size))
-    index = index + size * np.arange(draws)[:, None]
-    counts = np.bincount(index.ravel(), minlength=draws * size)
-    return jnp.asarray(counts.reshape(draws, size), float)
+def resample(random: np.random.Generator, size: int) -> Int[np.ndarray, " size"]:
+    """How often each of `size` things is in a resample."""
+    return np.bincount(random.integers(0, size, size, dtype=np.int32), minlength=size)
 
 
 def _mix(sample: Sample, estimate: Estimate) -> Mix:
-    lam = jnp.asarray(estimate.lam.value)
-    n, count = jnp.asarray(float(sample.n)), jnp.asarray(float(sample.n_unlabelled))
-    return estimate.scheme.mix(n, count, jnp.broadcast_to(lam, (len(lam), sample.n_context)))
+    lam = np.asarray(estimate.lam.value)
+    n, count = np.asarray(float(sample.n)), np.asarray(float(sample.n_unlabelled))
+    return estimate.scheme.mix(n, count, np.broadcast_to(lam, (len(lam), sample.n_context)))
+
+
+def _resampled(
+    random: np.random.Generator,
+    loss: AbstractLoss,
+    theta: Float[np.ndarray, " parameter"],
+    groups: tuple[tuple[Chunk, int], ...],
+    draws: int,
+) -> list[Means]:
+    """Means over resamples of some samples, for each of several groups of what is known of them.
+
+    Each group comes with its number of contexts. A loss that takes NumPy's arrays is asked resample by
+    resample, whose weights then stay in the processor's cache.
+    """
+    size = len(groups[0][0].weight)
+    counts = (resample(random, size) for _ in range(draws))
+    if loss.traits.numpy:
+        with np.errstate(all="ignore"):
+            return _one_by_one(loss, theta, groups, counts)
+    table = np.stack(list(counts))
+    found = (_at_once(loss, theta, rows, table * rows.weight, number) for rows, number in groups)
+    return [Means(*(np.asarray(part) for part in means)) for means in found]
+
+
+def _one_by_one(
+    loss: AbstractLoss,
+    theta: Float[np.ndarray, " parameter"],
+    groups: tuple[tuple[Chunk, int], ...],
+    counts: Iterator[Int[np.ndarray, " sample"]],
+) -> list[Means]:
+    hessian = Derivatives.of(loss).hessian
+    labels = [averaged(rows.prediction)[:, 0] for rows, _ in groups]
+    gradients = [loss.gradients(theta, rows.x, y) for (rows, _), y in zip(groups, labels, strict=True)]
+    found: list[list[tuple[list[Any], list[Any]]]] = [[] for _ in groups]
+    for count in counts:
+        for (rows, number), y, gradient, means in zip(groups, labels, gradients, found, strict=True):
+            weight = count * rows.weight
+            weight /= weight.sum()
+            inside = [weight * (rows.context == i) for i in range(number)] if number > 1 else [weight]
+            hessians = [hessian(theta, rows.x, y, part) for part in inside]
+            means.append(([part @ gradient for part in inside], hessians))
+    return [Means(*(np.array(part) for part in zip(*means, strict=True))) for means in found]
 
 
 @eqx.filter_jit
-def _resampled(
+def _at_once(
     loss: AbstractLoss,
-    theta: Float[Array, " parameter"],
+    theta: Float[Values, " parameter"],
     rows: Chunk,
-    counts: Float[Array, "draw sample"],
+    weights: Float[Values, "draw sample"],
     n_context: int,
-) -> Means:
-    def one(count: Array) -> Group:
-        weight = count * rows.weight
-        share = weight / jnp.sum(weight)
-        return group_sums(loss, theta, rows._replace(weight=share), n_context)
+) -> tuple[Values, Values]:
+    def one(weight: Values) -> Group:
+        return group_sums(loss, theta, rows._replace(weight=weight / weight.sum()), n_context)
 
-    group = jax.vmap(one)(counts)
-    return Means(group.gradient, group.hessian)
+    group = jax.vmap(one)(weights)
+    return group.gradient, group.hessian
 
 
 def _unlabelled_means(
-    key: PRNGKeyArray, loss: AbstractLoss, sample: Sample, theta: Float[Array, " parameter"], draws: int
+    random: np.random.Generator,
+    loss: AbstractLoss,
+    sample: Sample,
+    theta: Float[np.ndarray, " parameter"],
+    draws: int,
 ) -> Means:
     if sample.has_predictions and sample.n_unlabelled <= _FEW:
-        (chunk,) = sample.chunks()
+        rows = Chunk(*(np.concatenate(parts) for parts in zip(*sample.blocks(), strict=True)))
         parts = [
-            _resampled(loss, theta, chunk, counts, sample.n_context)
-            for _, counts in _batches(key, sample.n_unlabelled, len(theta), draws)
+            _resampled(random, loss, theta, ((rows, sample.n_context),), some.stop - some.start)[0]
+            for some in _batches(sample.n_unlabelled, len(theta), draws)
         ]
-        return Means(*(jnp.concatenate(part) for part in zip(*parts, strict=True)))
-    group = evaluate(loss, sample, theta).unlabelled
+        return Means(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    group = Group(*(np.asarray(part) for part in evaluate(loss, sample, theta).unlabelled))
     n_context, d = group.gradient.shape
     mean = group.gradient.reshape(-1)
-    second = jax.scipy.linalg.block_diag(*group.second)
-    size, vectors = jnp.linalg.eigh((second - jnp.outer(mean, mean)) / max(sample.n_unlabelled, 1))
-    noise = jax.random.normal(key, (draws, len(mean)), mean.dtype) * jnp.sqrt(jnp.maximum(size, 0.0))
+    second = linalg.block_diag(*group.second)
+    size, vectors = np.linalg.eigh((second - np.outer(mean, mean)) / max(sample.n_unlabelled, 1))
+    noise = random.standard_normal((draws, len(mean))) * np.sqrt(np.maximum(size, 0.0))
     gradient = (mean + noise @ vectors.T).reshape(draws, n_context, d)
-    return Means(gradient, jnp.broadcast_to(group.hessian, (draws, n_context, d, d)))
+    return Means(np.asarray(gradient), np.broadcast_to(group.hessian, (draws, n_context, d, d)))
 
 
-@jax.jit
-def _steps(mix: Mix, true: Means, predicted: Means, unlabelled: Means) -> Float[Array, "draw parameter"]:
+def _steps(mix: Mix, true: Means, predicted: Means, unlabelled: Means) -> Float[np.ndarray, "draw parameter"]:
     """The Newton step of each resample; with a lambda per parameter, each from its own corrected loss."""
+    true_share = float(mix.true)
 
-    def step(plus: Float[Array, " context"], minus: Float[Array, " context"]) -> Array:
-        def total(part: int) -> Array:
-            corrected = jnp.tensordot(unlabelled[part], plus, ([1], [0]))
-            return mix.true * true[part][:, 0] + corrected - jnp.tensordot(predicted[part], minus, ([1], [0]))
+    def step(plus: Float[np.ndarray, " context"], minus: Float[np.ndarray, " context"]) -> np.ndarray:
+        def total(part: int) -> np.ndarray:
+            corrected = np.tensordot(unlabelled[part], plus, ([1], [0]))
+            return (
+                true_share * true[part][:, 0] + corrected - np.tensordot(predicted[part], minus, ([1], [0]))
+            )
 
-        return jnp.linalg.solve(total(1), total(0)[..., None])[..., 0]
+        return np.linalg.solve(total(1), total(0)[..., None])[..., 0]
 
-    each = jax.vmap(step, out_axes=1)(mix.unlabelled, mix.predicted)
-    return jnp.diagonal(each, axis1=1, axis2=2)
+    weights = np.concatenate([np.asarray(mix.unlabelled), np.asarray(mix.predicted)], axis=1)
+    different, which = np.unique(weights, axis=0, return_inverse=True)
+    found = np.stack([step(*np.split(row, 2)) for row in different])
+    return found[which.reshape(-1), :, np.arange(len(weights))].T
 
 
 def _quantile_draws(
-    key: PRNGKeyArray, loss: Quantile, sample: Sample, estimate: Estimate, draws: int
+    random: np.random.Generator, loss: Quantile, sample: Sample, estimate: Estimate, draws: int
 ) -> Float[np.ndarray, "draw parameter"]:
     """Woodruff's way: the distribution function is resampled at the estimate and inverted around it."""
     problem = quantile_problem(loss, sample, estimate.scheme)
@@ -183,11 +221,10 @@ def _quantile_draws(
     theta = float(estimate.theta[0])
     prediction = sample.y if sample.prediction is None else sample.prediction
     step = true * (sample.y <= theta) - predicted * (prediction <= theta)
-    keys = jax.random.split(key)
-    counts = np.asarray(resample(keys[0], sample.n, draws)) * sample.labelled_weight
+    counts = np.stack([resample(random, sample.n) for _ in range(draws)]) * sample.labelled_weight
     labelled = counts @ step / counts.sum(axis=1)
     variance = problem.unlabelled_variance(theta)
-    noise = np.asarray(jax.random.normal(keys[1], (draws,))) * np.sqrt(variance)
+    noise = random.standard_normal(draws) * np.sqrt(variance)
     shift = labelled - sample.labelled_weight @ step / sample.n + unlabelled * noise
     function = problem.steps.function(true, unlabelled, predicted)
     start = function[np.searchsorted(problem.steps.value, theta)]

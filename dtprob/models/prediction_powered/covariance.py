@@ -2,10 +2,9 @@
 
 from typing import NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
+from dtprob.models.prediction_powered.arrays import Values, compiled_for_jax, namespace
 from dtprob.models.prediction_powered.losses import AbstractLoss
 from dtprob.models.prediction_powered.moments import Evaluation
 from dtprob.models.prediction_powered.schemes import Mix
@@ -20,13 +19,13 @@ class Spread(NamedTuple):
         degrees: degrees of freedom of each parameter's variance, by Welch and Satterthwaite.
     """
 
-    covariance: Float[Array, "parameter parameter"]
-    degrees: Float[Array, " parameter"]
+    covariance: Float[Values, "parameter parameter"]
+    degrees: Float[Values, " parameter"]
 
 
 def inverse_hessian(
     loss: AbstractLoss, evaluation: Evaluation, mix: Mix
-) -> Float[Array, "parameter parameter"]:
+) -> Float[Values, "parameter parameter"]:
     """Inverse of the mean second derivative of the loss over the population.
 
     Where it does not depend on labels every sample counts alike, otherwise it is that of the corrected loss.
@@ -34,26 +33,27 @@ def inverse_hessian(
     return _inverse(evaluation, mix, pooled=loss.traits.linear_in_label)
 
 
-@eqx.filter_jit
-def _inverse(evaluation: Evaluation, mix: Mix, *, pooled: bool) -> Array:
+@compiled_for_jax
+def _inverse(evaluation: Evaluation, mix: Mix, *, pooled: bool) -> Values:
+    xp = namespace(evaluation.gradient)
     labelled, unlabelled = evaluation.labelled.hessian[0], evaluation.unlabelled.hessian
     if pooled:
-        uses = jnp.any(mix.unlabelled != 0)
-        share = jnp.where(uses, evaluation.n_unlabelled / (evaluation.n + evaluation.n_unlabelled), 0.0)
-        hessian = (1 - share) * labelled + share * jnp.sum(unlabelled, axis=0)
+        uses = xp.any(mix.unlabelled != 0)
+        share = xp.where(uses, evaluation.n_unlabelled / (evaluation.n + evaluation.n_unlabelled), 0.0)
+        hessian = (1 - share) * labelled + share * xp.sum(unlabelled, axis=0)
     else:
-        corrected = jnp.tensordot(mix.unlabelled, unlabelled, 1)
+        corrected = xp.tensordot(mix.unlabelled, unlabelled, 1)
         hessian = (
-            mix.true * labelled + corrected - jnp.tensordot(mix.predicted, evaluation.predicted.hessian, 1)
+            mix.true * labelled + corrected - xp.tensordot(mix.predicted, evaluation.predicted.hessian, 1)
         )
-    diagonal = jnp.abs(jnp.diagonal(hessian))
-    scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(diagonal), 1.0)
-    return scale[:, None] * jnp.linalg.inv(scale[:, None] * hessian * scale) * scale
+    diagonal = xp.abs(xp.diagonal(hessian))
+    scale = xp.where(diagonal > 0, 1 / xp.sqrt(diagonal), 1.0)
+    return scale[:, None] * xp.linalg.inv(scale[:, None] * hessian * scale) * scale
 
 
-@eqx.filter_jit
+@compiled_for_jax
 def spread(
-    evaluation: Evaluation, mix: Mix, inverse: Float[Array, "parameter parameter"], practice: Practice
+    evaluation: Evaluation, mix: Mix, inverse: Float[Values, "parameter parameter"], practice: Practice
 ) -> Spread:
     """The sandwich covariance of an estimate.
 
@@ -63,29 +63,31 @@ def spread(
         inverse: inverse of the mean second derivative.
         practice: conventions.
     """
+    xp = namespace(evaluation.gradient)
     n, count, d = evaluation.n, evaluation.n_unlabelled, len(inverse)
     lost = d if practice.lost is None else practice.lost
-    inside = evaluation.context[:, None] == jnp.arange(evaluation.unlabelled.value.shape[0])
+    inside = evaluation.context[:, None] == xp.arange(evaluation.unlabelled.value.shape[0])
     predicted = inside.astype(inverse.dtype) @ mix.predicted.T * (evaluation.predicted_gradient @ inverse)
     influence = mix.true * (evaluation.gradient @ inverse) - predicted
-    influence = influence - jnp.mean(influence, axis=0)
-    labelled_degrees = jnp.maximum(n - lost, 1.0)
+    influence = influence - xp.mean(influence, axis=0)
+    labelled_degrees = xp.maximum(n - lost, 1.0)
     labelled = influence.T @ influence / labelled_degrees / n
-    unlabelled_degrees = jnp.maximum(count - min(lost, 1), 1.0)
+    unlabelled_degrees = xp.maximum(count - min(lost, 1), 1.0)
     unlabelled = _unlabelled(evaluation, mix.unlabelled, inverse) / unlabelled_degrees
-    variances = jnp.diagonal(labelled), jnp.diagonal(unlabelled)
-    tiny = jnp.finfo(inverse.dtype).tiny
+    variances = xp.diagonal(labelled), xp.diagonal(unlabelled)
+    tiny = xp.finfo(inverse.dtype).tiny
     total = variances[0] ** 2 / labelled_degrees + variances[1] ** 2 / unlabelled_degrees
-    degrees = (variances[0] + variances[1]) ** 2 / jnp.maximum(total, tiny)
-    return Spread(labelled + unlabelled, jnp.maximum(degrees, 1.0))
+    degrees = (variances[0] + variances[1]) ** 2 / xp.maximum(total, tiny)
+    return Spread(labelled + unlabelled, xp.maximum(degrees, 1.0))
 
 
 def _unlabelled(
     evaluation: Evaluation,
-    weight: Float[Array, "parameter context"],
-    inverse: Float[Array, "parameter parameter"],
-) -> Float[Array, "parameter parameter"]:
+    weight: Float[Values, "parameter context"],
+    inverse: Float[Values, "parameter parameter"],
+) -> Float[Values, "parameter parameter"]:
     group = evaluation.unlabelled
-    mean = jnp.sum(weight * (group.gradient @ inverse).T, axis=1)
-    second = jnp.einsum("jc,kc,pj,cpq,qk->jk", weight, weight, inverse, group.second, inverse)
-    return second - jnp.outer(mean, mean)
+    mean = (weight * (group.gradient @ inverse).T).sum(axis=1)
+    turned = inverse.T @ group.second @ inverse
+    second = (weight.T[:, :, None] * weight.T[:, None, :] * turned).sum(axis=0)
+    return second - mean[:, None] * mean

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Final, final
+from typing import Final, final, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
-from scipy import stats
+from jaxtyping import Float
+from scipy import special
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, unknown_name
+from dtprob.models.prediction_powered.arrays import Values, namespace
 from dtprob.models.prediction_powered.covariance import inverse_hessian, spread
 from dtprob.models.prediction_powered.losses import AbstractLoss, named_loss
 from dtprob.models.prediction_powered.moments import Evaluation, evaluate
@@ -85,10 +86,11 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         evaluation = problem.at(theta)
     inverse = problem.inverse(evaluation, lam)
     found = spread(evaluation, problem.mixes(lam.value), inverse, practice)
-    alone = spread(evaluation, problem.mixes(jnp.zeros_like(lam.value)), inverse, practice)
+    alone = spread(evaluation, problem.mixes(0 * lam.value), inverse, practice)
     covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
     chance = (1 + level) / 2
-    quantile = stats.norm.ppf(chance) if practice.reference == "normal" else stats.t.ppf(chance, degrees)
+    is_normal = practice.reference == "normal"
+    quantile = special.ndtri(chance) if is_normal else special.stdtrit(degrees, chance)
     half = quantile * np.sqrt(np.diagonal(covariance))
     point, sample = np.asarray(theta), problem.sample
     return Estimate(
@@ -108,6 +110,8 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
 
 
 def _check_contexts(by: By, sample: Sample, practice: Practice) -> None:
+    if by not in get_args(By.__value__):
+        raise unknown_name("by", by, get_args(By.__value__), "choice")
     if by == "context" and practice.form == "estimates":
         remedy = "Use form loss, or tune overall"
         raise InputError("practice", "form loss, to tune by context", "form estimates", remedy)
@@ -117,7 +121,8 @@ def _check_contexts(by: By, sample: Sample, practice: Practice) -> None:
 
 
 def _problem(loss: AbstractLoss, sample: Sample, scheme: Scheme, practice: Practice) -> _Problem:
-    theta = loss.start(jnp.asarray(sample.features), jnp.asarray(sample.y))
+    xp = np if loss.traits.numpy else jnp
+    theta = loss.start(xp.asarray(sample.features), xp.asarray(sample.y))
     return _Problem(loss, sample, scheme, practice, theta, evaluate(loss, sample, theta))
 
 
@@ -130,7 +135,7 @@ class _Problem:
     sample: Sample
     scheme: Scheme
     practice: Practice
-    theta: Float[Array, " parameter"]
+    theta: Float[Values, " parameter"]
     start: Evaluation
 
     @property
@@ -151,36 +156,37 @@ class _Problem:
         weighted = self.sample.weight is not None or self.sample.weight_unlabelled is not None
         return self.loss.traits.translation and not weighted
 
-    def at(self, theta: Float[Array, " parameter"]) -> Evaluation:
+    def at(self, theta: Float[Values, " parameter"]) -> Evaluation:
         return self.start if self.is_translation else evaluate(self.loss, self.sample, theta)
 
-    def mixes(self, lam: Float[Array, "*parameter context"]) -> Mix:
+    def mixes(self, lam: Float[Values, "*parameter context"]) -> Mix:
         return self.scheme.mix(self.start.n, self.start.n_unlabelled, lam)
 
-    def inverse(self, evaluation: Evaluation, lam: Lambda) -> Float[Array, "parameter parameter"]:
-        return inverse_hessian(self.loss, evaluation, self.mixes(jnp.mean(lam.value, axis=0)))
+    def inverse(self, evaluation: Evaluation, lam: Lambda) -> Float[Values, "parameter parameter"]:
+        return inverse_hessian(self.loss, evaluation, self.mixes(lam.value.mean(axis=0)))
 
     def solve(
-        self, lam: Lambda, theta: Float[Array, " parameter"], evaluation: Evaluation
-    ) -> Float[Array, " parameter"]:
+        self, lam: Lambda, theta: Float[Values, " parameter"], evaluation: Evaluation
+    ) -> Float[Values, " parameter"]:
         """Each parameter from the corrected loss with its own lambda, sought from `theta`."""
         if self.is_translation:
             theta = self.theta
+        xp = namespace(theta)
         rows, inverse = np.unique(np.asarray(lam.value), axis=0, return_inverse=True)
-        found = [self._minimise(jnp.asarray(row), theta, evaluation) for row in rows]
-        return jnp.stack(found)[inverse.reshape(-1), jnp.arange(len(self.theta))]
+        found = [self._minimise(xp.asarray(row), theta, evaluation) for row in rows]
+        return xp.stack(found)[inverse.reshape(-1), np.arange(len(self.theta))]
 
     def _minimise(
-        self, lam: Float[Array, " context"], theta: Float[Array, " parameter"], evaluation: Evaluation
-    ) -> Float[Array, " parameter"]:
-        def least(mix: Mix) -> Array:
+        self, lam: Float[Values, " context"], theta: Float[Values, " parameter"], evaluation: Evaluation
+    ) -> Float[Values, " parameter"]:
+        def least(mix: Mix) -> Values:
             return minimise(self.loss, self.sample, mix, evaluation, theta)
 
         mix = self.mixes(lam)
         if self.practice.form == "loss" or self.scheme.pooled:
             return least(mix)
-        zero, one = jnp.zeros_like(mix.true), jnp.ones_like(lam)
+        zero, one = 0 * mix.true, 0 * lam + 1
         own = least(Mix(mix.true, 0 * one, 0 * one))
-        if not bool(jnp.any(lam > 0)):
+        if not bool((lam > 0).any()):
             return own
         return own + lam[0] * (least(Mix(zero, one, 0 * one)) - least(Mix(zero, 0 * one, -one)))

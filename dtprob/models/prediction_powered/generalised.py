@@ -63,7 +63,7 @@ class LabelLoss(dist.Distribution):
     def log_prob(self, value: Any, intermediates: Any = None) -> Array:
         """Minus the weighted loss of each label."""
         del intermediates
-        return -self.weight * self.loss.values(self.theta, self.x, value)
+        return -self.weight * jnp.asarray(self.loss.values(self.theta, self.x, value))
 
     def sample(self, key: PRNGKeyArray | None, sample_shape: tuple[int, ...] = ()) -> Array:
         """Refuse: a loss says how wrong a label is, not how labels come about.
@@ -103,7 +103,7 @@ class ExactCorrection(AbstractCorrection):
         n_context = len(self.mix.unlabelled)
         plus = group_sums(loss, theta, self.unlabelled, n_context).value / len(self.unlabelled.weight)
         minus = group_sums(loss, theta, self.predicted, n_context).value / len(self.predicted.weight)
-        return self.mix.unlabelled @ plus - self.mix.predicted @ minus
+        return jnp.asarray(self.mix.unlabelled @ plus - self.mix.predicted @ minus)
 
 
 @final
@@ -189,9 +189,9 @@ def posterior_data(
     """
     if isinstance(loss, Quantile):
         raise InputError("loss", "one with a second derivative", "a quantile", "Use SmoothQuantile")
-    chosen, center = named_loss(loss), jnp.asarray(estimate.theta)
+    chosen, center = named_loss(loss), np.asarray(estimate.theta)
     mix = _mean_mix(sample, estimate)
-    minimiser = minimise(chosen, sample, mix, evaluate(chosen, sample, center), center)
+    minimiser = jnp.asarray(minimise(chosen, sample, mix, evaluate(chosen, sample, center), center))
     evaluation = evaluate(chosen, sample, minimiser)
     hessian = sample.n * _corrected(evaluation, mix, "hessian")
     covariance = _widened(estimate)
@@ -204,7 +204,7 @@ def posterior_data(
         "correction": _correction(chosen, sample, evaluation, mix, minimiser),
         "strength": jnp.asarray(rate * sample.n),
         "minimiser": minimiser,
-        "center": center,
+        "center": jnp.asarray(center),
         "turn": jnp.asarray(turn),
         "prior_scale": jnp.broadcast_to(jnp.asarray(spread), center.shape),
         "y": jnp.asarray(sample.y),
@@ -212,9 +212,9 @@ def posterior_data(
 
 
 def _mean_mix(sample: Sample, estimate: Estimate) -> Mix:
-    lam = jnp.asarray(np.mean(estimate.lam.value, axis=0))
-    n, count = jnp.asarray(float(sample.n)), jnp.asarray(float(max(sample.n_unlabelled, 1)))
-    return estimate.scheme.mix(n, count, jnp.broadcast_to(lam, (sample.n_context,)))
+    lam = np.broadcast_to(np.mean(estimate.lam.value, axis=0), (sample.n_context,))
+    n, count = np.asarray(float(sample.n)), np.asarray(float(max(sample.n_unlabelled, 1)))
+    return estimate.scheme.mix(n, count, lam)
 
 
 def _corrected(evaluation: Evaluation, mix: Mix, part: str, *, labelled: bool = True) -> Array:
@@ -263,4 +263,5 @@ def _correction(
     whole: Chunk = jax.tree.map(lambda *parts: jnp.concatenate(parts)[: sample.n_unlabelled], *chunks)
     if loss.traits.linear_in_label:
         whole = whole._replace(prediction=jnp.mean(whole.prediction, axis=1, keepdims=True))
-    return ExactCorrection(whole, labelled_rows(sample)[1], mix)
+    parts: tuple[Chunk, Mix] = jax.tree.map(jnp.asarray, (labelled_rows(sample)[1], mix))
+    return ExactCorrection(whole, *parts)

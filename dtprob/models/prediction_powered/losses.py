@@ -15,29 +15,49 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Scalar
 
 from dtprob.errors import InputError, unknown_name
+from dtprob.models.prediction_powered.arrays import Values, namespace
 
 type Link = Literal["identity", "logit", "log"]
-type Parameters = Float[Array, " parameter"]
-type Features = Float[Array, "sample feature"]
-type Labels = Float[Array, "sample ..."]
-type PerSample = Float[Array, " sample"]
-type Gradients = Float[Array, "sample parameter"]
-type Matrix = Float[Array, "parameter parameter"]
+type Parameters = Float[Values, " parameter"]
+type Features = Float[Values, "sample feature"]
+type Labels = Float[Values, "sample ..."]
+type PerSample = Float[Values, " sample"]
+type Gradients = Float[Values, "sample parameter"]
+type Matrix = Float[Values, "parameter parameter"]
 
-_CUMULANT: Final[dict[str, Callable[[Array], Array]]] = {
+
+def _exp(eta: Values) -> Values:
+    return namespace(eta).exp(eta)
+
+
+def _softplus(eta: Values) -> Values:
+    return namespace(eta).logaddexp(eta, 0.0)
+
+
+def _sigmoid(eta: Values) -> Values:
+    small = _exp(-abs(eta))
+    return namespace(eta).where(eta >= 0, 1.0, small) / (1 + small)
+
+
+def _sigmoid_slope(eta: Values) -> Values:
+    small = _exp(-abs(eta))
+    return small / (1 + small) ** 2
+
+
+_CUMULANT: Final[dict[str, Callable[[Values], Values]]] = {
     "identity": lambda eta: 0.5 * eta**2,
-    "logit": jax.nn.softplus,
-    "log": jnp.exp,
+    "logit": _softplus,
+    "log": _exp,
 }
-_MEAN: Final[dict[str, Callable[[Array], Array]]] = {
+_MEAN: Final[dict[str, Callable[[Values], Values]]] = {
     "identity": lambda eta: eta,
-    "logit": jax.nn.sigmoid,
-    "log": jnp.exp,
+    "logit": _sigmoid,
+    "log": _exp,
 }
-_VARIANCE: Final[dict[str, Callable[[Array], Array]]] = {
-    "identity": jnp.ones_like,
-    "logit": lambda eta: jax.nn.sigmoid(eta) * jax.nn.sigmoid(-eta),
-    "log": jnp.exp,
+_VARIANCE: Final[dict[str, Callable[[Values], Values]]] = {
+    "identity": lambda eta: namespace(eta).ones_like(eta),
+    "logit": _sigmoid_slope,
+    "log": _exp,
 }
 
 
@@ -49,11 +69,14 @@ class Traits(NamedTuple):
             can be averaged before the gradient is taken.
         quadratic: the loss is quadratic in theta, so that one Newton step is exact.
         translation: theta only shifts the gradient, so that its covariances do not depend on theta.
+        numpy: the methods take NumPy's arrays as well and then return such, so that nothing is compiled; only
+            together with linear_in_label.
     """
 
     linear_in_label: bool = False
     quadratic: bool = False
     translation: bool = False
+    numpy: bool = False
 
 
 class AbstractLoss(eqx.Module):
@@ -88,17 +111,17 @@ class Mean(AbstractLoss):
     @property
     def traits(self) -> Traits:
         """Linear in the label, quadratic in theta."""
-        return Traits(linear_in_label=True, quadratic=True, translation=True)
+        return Traits(linear_in_label=True, quadratic=True, translation=True, numpy=True)
 
     def start(self, x: Features, y: Labels) -> Parameters:
         """The origin."""
         del x
-        return jnp.zeros(_flat(y).shape[1], jnp.result_type(y, float))
+        return namespace(y).zeros(_flat(y).shape[1], jnp.result_type(y, float))
 
     def values(self, theta: Parameters, x: Features, y: Labels) -> PerSample:
         """Half the squared distance of each label."""
         del x
-        return 0.5 * jnp.sum((theta - _flat(y)) ** 2, axis=1)
+        return 0.5 * ((theta - _flat(y)) ** 2).sum(axis=1)
 
     def gradients(self, theta: Parameters, x: Features, y: Labels) -> Gradients:
         """Theta minus the label."""
@@ -108,7 +131,7 @@ class Mean(AbstractLoss):
     def hessian(self, theta: Parameters, x: Features, y: Labels, weight: PerSample) -> Matrix:
         """The total weight times the identity."""
         del x, y
-        return jnp.sum(weight) * jnp.eye(len(theta), dtype=theta.dtype)
+        return weight.sum() * namespace(theta).eye(len(theta), dtype=theta.dtype)
 
 
 @final
@@ -126,11 +149,11 @@ class GeneralizedLinear(AbstractLoss):
     @property
     def traits(self) -> Traits:
         """Linear in the label; quadratic when the link is the identity."""
-        return Traits(linear_in_label=True, quadratic=self.link == "identity")
+        return Traits(linear_in_label=True, quadratic=self.link == "identity", numpy=True)
 
     def start(self, x: Features, y: Labels) -> Parameters:
         """The origin."""
-        return jnp.zeros(x.shape[1], jnp.result_type(x, y, float))
+        return namespace(x).zeros(x.shape[1], jnp.result_type(x, y, float))
 
     def values(self, theta: Parameters, x: Features, y: Labels) -> PerSample:
         """Negative log likelihood of each sample, up to a term without theta."""
@@ -208,13 +231,13 @@ class CustomLoss(AbstractLoss):
         """Nothing to save."""
         return Traits()
 
-    def one(self, theta: Parameters, x: Float[Array, " feature"], y: Float[Array, "..."]) -> Scalar:
+    def one(self, theta: Parameters, x: Float[Values, " feature"], y: Float[Values, "..."]) -> Scalar:
         """The loss of one sample at a flat parameter vector."""
-        return self.function(self.unravel(theta), x, y)
+        return self.function(self.unravel(theta), jnp.asarray(x), jnp.asarray(y))
 
     def unravel(self, theta: Parameters) -> Any:
         """The parameters with the structure of `initial`."""
-        return ravel_pytree(self.initial)[1](theta)
+        return ravel_pytree(self.initial)[1](jnp.asarray(theta))
 
     def start(self, x: Features, y: Labels) -> Parameters:
         """The initial parameters, flat."""

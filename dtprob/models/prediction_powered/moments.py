@@ -4,18 +4,20 @@ The unlabelled samples enter only through sums, which are taken chunk by chunk; 
 kept sample by sample.
 """
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Generator
+from functools import partial
+from typing import Any, NamedTuple, Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Float, Int
 
 from dtprob.errors import InputError
+from dtprob.models.prediction_powered.arrays import Values, compiled_for_jax, each, namespace
 from dtprob.models.prediction_powered.losses import AbstractLoss
-from dtprob.models.prediction_powered.sample import Chunk, Sample
+from dtprob.models.prediction_powered.sample import Chunk, Sample, averaged
 
 
 class Group(NamedTuple):
@@ -28,10 +30,10 @@ class Group(NamedTuple):
         second: outer product of the (weighted) gradient with itself.
     """
 
-    value: Float[Array, " context"]
-    gradient: Float[Array, "context parameter"]
-    hessian: Float[Array, "context parameter parameter"]
-    second: Float[Array, "context parameter parameter"]
+    value: Float[Values, " context"]
+    gradient: Float[Values, "context parameter"]
+    hessian: Float[Values, "context parameter parameter"]
+    second: Float[Values, "context parameter parameter"]
 
 
 class Evaluation(NamedTuple):
@@ -51,19 +53,21 @@ class Evaluation(NamedTuple):
     labelled: Group
     predicted: Group
     unlabelled: Group
-    gradient: Float[Array, "sample parameter"]
-    predicted_gradient: Float[Array, "sample parameter"]
-    context: Int[Array, " sample"]
-    n: Float[Array, ""]
-    n_unlabelled: Float[Array, ""]
+    gradient: Float[Values, "sample parameter"]
+    predicted_gradient: Float[Values, "sample parameter"]
+    context: Int[Values, " sample"]
+    n: Float[Values, ""]
+    n_unlabelled: Float[Values, ""]
 
 
-def evaluate(loss: AbstractLoss, sample: Sample, theta: Float[Array, " parameter"]) -> Evaluation:
+def evaluate(loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"]) -> Evaluation:
     """Read the data once at `theta`.
 
     Raises:
         InputError: NaN or infinity among the unlabelled features or predictions.
     """
+    xp = np if loss.traits.numpy else jnp
+    theta = xp.asarray(theta)
     n_context = sample.n_context
     rows = labelled_rows(sample)
     labelled, predicted, gradient, predicted_gradient = _labelled(loss, theta, *rows, n_context)
@@ -73,25 +77,24 @@ def evaluate(loss: AbstractLoss, sample: Sample, theta: Float[Array, " parameter
         _unlabelled(loss, sample, theta, n_context),
         gradient,
         predicted_gradient,
-        rows[1].context,
-        jnp.asarray(sample.n, theta.dtype),
-        jnp.asarray(max(sample.n_unlabelled, 1), theta.dtype),
+        xp.asarray(rows[1].context),
+        xp.asarray(sample.n, theta.dtype),
+        xp.asarray(max(sample.n_unlabelled, 1), theta.dtype),
     )
 
 
 def labelled_rows(sample: Sample) -> tuple[Chunk, Chunk]:
-    """The labelled samples with their labels, and with their predictions."""
-    x, weight = jnp.asarray(sample.features), jnp.asarray(sample.labelled_weight)
-    context = jnp.asarray(sample.labelled_context)
-    y = jnp.asarray(sample.y)[:, None]
-    prediction = y if sample.prediction is None else jnp.asarray(sample.prediction)[:, None]
-    return Chunk(x, y, weight, jnp.zeros_like(context)), Chunk(x, prediction, weight, context)
+    """The labelled samples with their labels, and with their predictions, as NumPy's arrays."""
+    x, weight, context = sample.features, sample.labelled_weight, sample.labelled_context
+    prediction = sample.y if sample.prediction is None else sample.prediction
+    true = Chunk(x, sample.y[:, None], weight, np.zeros_like(context))
+    return true, Chunk(x, prediction[:, None], weight, context)
 
 
-@eqx.filter_jit
+@compiled_for_jax
 def _labelled(
-    loss: AbstractLoss, theta: Float[Array, " parameter"], true: Chunk, predicted: Chunk, n_context: int
-) -> tuple[Group, Group, Array, Array]:
+    loss: AbstractLoss, theta: Float[Values, " parameter"], true: Chunk, predicted: Chunk, n_context: int
+) -> tuple[Group, Group, Values, Values]:
     groups = [group_sums(loss, theta, true, 1), group_sums(loss, theta, predicted, n_context)]
     gradients = [
         rows.weight[:, None] * loss.gradients(theta, rows.x, rows.prediction[:, 0])
@@ -102,15 +105,14 @@ def _labelled(
 
 
 def _unlabelled(
-    loss: AbstractLoss, sample: Sample, theta: Float[Array, " parameter"], n_context: int
+    loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"], n_context: int
 ) -> Group:
     if not sample.has_predictions:
         return _empty(theta, n_context)
     total: Group | None = None
-    for chunk in sample.chunks(averaged=loss.traits.linear_in_label):
-        sums = _chunk_sums(loss, theta, chunk, n_context)
-        total = sums if total is None else jax.tree.map(jnp.add, total, sums)
-    if total is None or not all(bool(jnp.all(jnp.isfinite(part))) for part in total):
+    for sums in _all_sums(loss, sample, theta, n_context):
+        total = sums if total is None else Group(*(a + b for a, b in zip(total, sums, strict=True)))
+    if total is None or not all(np.isfinite(part).all() for part in total):
         _locate(sample)
         raise InputError(
             "loss",
@@ -121,38 +123,77 @@ def _unlabelled(
     return _scaled(total, sample.n_unlabelled)
 
 
-def _empty(theta: Float[Array, " parameter"], n_context: int) -> Group:
-    zero, d = jnp.zeros(n_context, theta.dtype), len(theta)
-    matrix = jnp.zeros((n_context, d, d), theta.dtype)
-    return Group(zero, jnp.zeros((n_context, d), theta.dtype), matrix, matrix)
+def _all_sums(
+    loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"], n_context: int
+) -> Generator[Group]:
+    """The sums over one part of the unlabelled samples after another."""
+    if not loss.traits.numpy:
+        for chunk in sample.chunks(averaged=loss.traits.linear_in_label):
+            yield _chunk_sums(loss, theta, chunk, n_context)
+        return
+    derivatives = Derivatives.of(loss)
+    for block in sample.blocks():
+        with np.errstate(all="ignore"):
+            sums = _sums(derivatives, theta, block, n_context)
+        yield sums
+
+
+def _empty(theta: Float[Values, " parameter"], n_context: int) -> Group:
+    xp, d = namespace(theta), len(theta)
+    matrix = xp.zeros((n_context, d, d), theta.dtype)
+    return Group(xp.zeros(n_context, theta.dtype), xp.zeros((n_context, d), theta.dtype), matrix, matrix)
 
 
 def _scaled(group: Group, count: int) -> Group:
-    return jax.tree.map(lambda total: total / count, group)
+    return Group(*(total / count for total in group))
 
 
-def group_sums(loss: AbstractLoss, theta: Float[Array, " parameter"], chunk: Chunk, n_context: int) -> Group:
+class Derivatives(NamedTuple):
+    """The methods of a loss as plain functions; a block of samples takes less time than a call of a module's."""
+
+    values: Callable[..., Any]
+    gradients: Callable[..., Any]
+    hessian: Callable[..., Any]
+    linear_in_label: bool
+
+    @classmethod
+    def of(cls, loss: AbstractLoss) -> Self:
+        """Of a loss."""
+        kind = type(loss)
+        methods = (partial(method, loss) for method in (kind.values, kind.gradients, kind.hessian))
+        return cls(*methods, linear_in_label=loss.traits.linear_in_label)
+
+
+def group_sums(loss: AbstractLoss, theta: Float[Values, " parameter"], chunk: Chunk, n_context: int) -> Group:
     """Weighted sums of loss, gradient, second derivative and squared gradient, per context."""
+    return _sums(Derivatives.of(loss), theta, chunk, n_context)
+
+
+def _sums(
+    derivatives: Derivatives, theta: Float[Values, " parameter"], chunk: Chunk, n_context: int
+) -> Group:
     x, prediction, weight, context = chunk
-    if loss.traits.linear_in_label:
-        prediction = jnp.mean(prediction, axis=1, keepdims=True)
-    columns = jnp.moveaxis(prediction, 1, 0)
+    if derivatives.linear_in_label:
+        prediction = averaged(prediction)
+    values = _over_predictors(lambda y: derivatives.values(theta, x, y), prediction)
+    gradients = _over_predictors(lambda y: derivatives.gradients(theta, x, y), prediction)
 
-    def mean_over_predictors(function: Callable[[Array], Array]) -> Array:
-        return jnp.mean(jax.vmap(function)(columns), axis=0) if len(columns) > 1 else function(columns[0])
-
-    values = mean_over_predictors(lambda y: loss.values(theta, x, y))
-    gradients = mean_over_predictors(lambda y: loss.gradients(theta, x, y))
-
-    def of_context(masked: Float[Array, " sample"]) -> Group:
+    def of_context(masked: Any) -> Group:
         weighted = masked[:, None] * gradients
-        hessian = mean_over_predictors(lambda y: loss.hessian(theta, x, y, masked))
-        return Group(masked @ values, jnp.sum(weighted, axis=0), hessian, weighted.T @ weighted)
+        hessian = _over_predictors(lambda y: derivatives.hessian(theta, x, y, masked), prediction)
+        return Group(masked @ values, masked @ gradients, hessian, weighted.T @ weighted)
 
     if n_context == 1:
-        return jax.tree.map(lambda total: total[None], of_context(weight))
-    masks = weight * (context == jnp.arange(n_context)[:, None])
-    return jax.vmap(of_context)(masks)
+        return Group(*(total[None] for total in of_context(weight)))
+    masks = weight * (context == namespace(context).arange(n_context)[:, None])
+    return each(of_context, masks)
+
+
+def _over_predictors(function: Callable[[Any], Any], prediction: Values) -> Any:
+    """The mean over predictors of a function of the predicted labels."""
+    if prediction.shape[1] == 1:
+        return function(prediction[:, 0])
+    return jnp.mean(jax.vmap(function, 1)(prediction), axis=0)
 
 
 _chunk_sums = eqx.filter_jit(group_sums)

@@ -10,7 +10,6 @@ from dataclasses import dataclass
 from typing import NamedTuple, final
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 from scipy import stats
@@ -94,7 +93,7 @@ def estimate_quantile(
     lam = fixed(start, problem.evaluation(0.0))
     theta = problem.nearest(lam)
     for _ in range(practice.rounds if scheme.is_tuned else 0):
-        lam = tune(problem.evaluation(theta), jnp.ones((1, 1)), "overall", practice)
+        lam = tune(problem.evaluation(theta), np.ones((1, 1)), "overall", practice)
         theta = problem.nearest(lam)
     return problem.result(theta, lam, level)
 
@@ -151,27 +150,27 @@ class QuantileProblem:
         sample, level, there = self.sample, self.loss.level, self.steps.at(theta)
         prediction = sample.y if sample.prediction is None else sample.prediction
 
-        def gradient(values: np.ndarray) -> jax.Array:
-            return jnp.asarray(sample.labelled_weight * ((values <= theta) - level))[:, None]
+        def gradient(values: np.ndarray) -> np.ndarray:
+            return (sample.labelled_weight * ((values <= theta) - level))[:, None]
 
         mean = there.unlabelled[0] - level
         second = there.square[0] - 2 * level * there.unlabelled[0] + level**2
-        one = jnp.ones((1, 1, 1))
-        nothing = Group(jnp.zeros(1), jnp.zeros((1, 1)), one, one)
+        one = np.ones((1, 1, 1))
+        nothing = Group(np.zeros(1), np.zeros((1, 1)), one, one)
         return Evaluation(
             labelled=nothing,
             predicted=nothing,
-            unlabelled=Group(jnp.zeros(1), jnp.full((1, 1), mean), one, jnp.full((1, 1, 1), second)),
+            unlabelled=Group(np.zeros(1), np.full((1, 1), mean), one, np.full((1, 1, 1), second)),
             gradient=gradient(sample.y),
             predicted_gradient=gradient(prediction),
-            context=jnp.zeros(sample.n, int),
-            n=jnp.asarray(float(sample.n)),
-            n_unlabelled=jnp.asarray(float(max(sample.n_unlabelled, 1))),
+            context=np.zeros(sample.n, int),
+            n=np.asarray(float(sample.n)),
+            n_unlabelled=np.asarray(float(max(sample.n_unlabelled, 1))),
         )
 
     def mix(self, lam: Lambda) -> tuple[float, float, float]:
         """The weights of the three distribution functions."""
-        n, count = jnp.asarray(float(self.sample.n)), jnp.asarray(float(self.sample.n_unlabelled))
+        n, count = np.asarray(float(self.sample.n)), np.asarray(float(self.sample.n_unlabelled))
         mix = self.scheme.mix(n, count, lam.value[0])
         return float(mix.true), float(mix.unlabelled[0]), float(mix.predicted[0])
 

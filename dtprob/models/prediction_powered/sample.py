@@ -9,9 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from dtprob.errors import InputError
+from dtprob.models.prediction_powered.arrays import Values
 
 _CHUNK_NUMBERS: Final = 16_000_000
 """Numbers in a chunk of unlabelled data, 128 MB in double precision."""
+_BLOCK_NUMBERS: Final = 9000
+"""Numbers in a block; OpenBLAS shares out the product of a vector with a larger matrix among threads, which for
+so little work costs more than it saves."""
 
 type Predictor = Callable[[np.ndarray], np.ndarray]
 
@@ -19,10 +23,10 @@ type Predictor = Callable[[np.ndarray], np.ndarray]
 class Chunk(NamedTuple):
     """Consecutive unlabelled samples; rows added to fill a chunk have weight 0."""
 
-    x: Float[Array, "sample feature"]
-    prediction: Float[Array, "sample fold ..."]
-    weight: Float[Array, " sample"]
-    context: Int[Array, " sample"]
+    x: Float[Values, "sample feature"]
+    prediction: Float[Values, "sample fold ..."]
+    weight: Float[Values, " sample"]
+    context: Int[Values, " sample"]
 
 
 @final
@@ -156,7 +160,7 @@ class Sample:
         return np.zeros(self.n, int) if self.context is None else self.context
 
     def chunks(self, *, averaged: bool = False) -> Generator[Chunk]:
-        """The unlabelled samples, one chunk after another, all of one size.
+        """The unlabelled samples as JAX's arrays, one chunk after another, all of one size.
 
         Args:
             averaged: give the average of all predictors instead of each.
@@ -165,12 +169,20 @@ class Sample:
         if name in self._whole:
             yield self._whole[name]
             return
-        rows = self.rows_per_chunk
-        for start in range(0, self.n_unlabelled, rows):
-            chunk = self._read(slice(start, min(start + rows, self.n_unlabelled)), rows, averaged=averaged)
-            if rows >= self.n_unlabelled:
+        size = self.rows_per_chunk
+        for read in self._read():
+            chunk = _filled(_averaged(read) if averaged else read, size)
+            if size >= self.n_unlabelled:
                 self._whole[name] = chunk
             yield chunk
+
+    def blocks(self) -> Generator[Chunk]:
+        """The unlabelled samples as NumPy's arrays, in blocks that a processor's cache holds."""
+        for chunk in self._read():
+            width = max(chunk.x.shape[1], chunk.prediction[0].size)
+            rows = max(_BLOCK_NUMBERS // width, 1000)
+            for start in range(0, len(chunk.weight), rows):
+                yield Chunk(*(part[start : start + rows] for part in chunk))
 
     @property
     def rows_per_chunk(self) -> int:
@@ -182,30 +194,48 @@ class Sample:
         width = self.features.shape[1] + int(np.prod(shape)) + 2
         return min(max(_CHUNK_NUMBERS // width, 1024), max(self.n_unlabelled, 1))
 
-    def _read(self, rows: slice, size: int, *, averaged: bool) -> Chunk:
-        count = rows.stop - rows.start
-        x = np.zeros((count, 0)) if self.x_unlabelled is None else self.x_unlabelled[rows]
-        given = self.prediction_unlabelled
-        prediction: Any = given(np.asarray(x)) if callable(given) else given[rows]
-        shape = _prediction_shape(np.shape(prediction), count, self.y.shape[1:])
-        if averaged and shape[1] > 1:
-            columns = np.moveaxis(np.asarray(prediction), 1, -1)
-            share = np.full(shape[1], 1 / shape[1])
-            prediction, shape = np.einsum("...k,k->...", columns, share), (count, 1, *shape[2:])
-        weight = jnp.ones(count) if self.weight_unlabelled is None else self.weight_unlabelled[rows]
-        context = jnp.zeros(count, int) if self.context_unlabelled is None else self.context_unlabelled[rows]
-        short = size - count
+    def _read(self) -> Generator[Chunk]:
+        """The unlabelled samples as they are given, a bounded amount at a time."""
+        rows, count = self.rows_per_chunk, self.n_unlabelled
+        ones, zeros = np.ones(min(rows, count)), np.zeros(min(rows, count), int)
+        for start in range(0, count, rows):
+            here = slice(start, min(start + rows, count))
+            size = here.stop - start
+            x = np.zeros((size, 0)) if self.x_unlabelled is None else np.asarray(self.x_unlabelled[here])
+            given = self.prediction_unlabelled
+            prediction = np.asarray(given(x) if callable(given) else given[here])
+            weight, context = self.weight_unlabelled, self.context_unlabelled
+            yield Chunk(
+                x,
+                prediction.reshape(_prediction_shape(prediction.shape, size, self.y.shape[1:])),
+                ones[:size] if weight is None else weight[here],
+                zeros[:size] if context is None else context[here],
+            )
 
-        def filled(array: Any, shape: tuple[int, ...]) -> Array:
-            whole = jnp.asarray(array).reshape(shape)
-            return jnp.pad(whole, [(0, short), *[(0, 0)] * (len(shape) - 1)]) if short else whole
 
-        return Chunk(
-            filled(x, np.shape(x)),
-            filled(prediction, shape),
-            filled(weight, (count,)),
-            filled(context, (count,)),
-        )
+def averaged(prediction: Float[Values, "sample fold ..."]) -> Float[Values, "sample 1 ..."]:
+    """The mean over predictors."""
+    count = prediction.shape[1]
+    if count == 1:
+        return prediction
+    if prediction.ndim == 2:
+        return (prediction @ np.full(count, 1 / count, prediction.dtype))[:, None]
+    return prediction.mean(axis=1, keepdims=True)
+
+
+def _averaged(chunk: Chunk) -> Chunk:
+    return chunk._replace(prediction=averaged(chunk.prediction))
+
+
+def _filled(chunk: Chunk, size: int) -> Chunk:
+    """JAX's arrays of `size` rows."""
+    short = size - len(chunk.weight)
+
+    def filled(array: Values) -> Array:
+        whole = jnp.asarray(array)
+        return jnp.pad(whole, [(0, short), *[(0, 0)] * (whole.ndim - 1)]) if short else whole
+
+    return Chunk(*(filled(part) for part in chunk))
 
 
 def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]) -> tuple[int, ...]:

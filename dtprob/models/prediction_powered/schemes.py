@@ -12,10 +12,10 @@ and Candes, Cross-prediction-powered inference (2024); Sifaou and Simeone, arXiv
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, final
 
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from dtprob.errors import unknown_name
+from dtprob.models.prediction_powered.arrays import Values, namespace
 
 type Training = Literal["none", "all", "split", "cross"]
 
@@ -23,9 +23,9 @@ type Training = Literal["none", "all", "split", "cross"]
 class Mix(NamedTuple):
     """The weights of the three terms; the last two may differ between contexts."""
 
-    true: Float[Array, ""]
-    unlabelled: Float[Array, " context"]
-    predicted: Float[Array, " context"]
+    true: Float[Values, ""]
+    unlabelled: Float[Values, " context"]
+    predicted: Float[Values, " context"]
 
 
 @final
@@ -52,7 +52,9 @@ class Scheme:
         """Whether lambda comes from the data."""
         return self.lam is None
 
-    def mix(self, n: Float[Array, ""], n_unlabelled: Float[Array, ""], lam: Float[Array, " context"]) -> Mix:
+    def mix(
+        self, n: Float[Values, ""], n_unlabelled: Float[Values, ""], lam: Float[Values, " context"]
+    ) -> Mix:
         """The weights of the three terms.
 
         Args:
@@ -60,10 +62,11 @@ class Scheme:
             n_unlabelled: unlabelled samples.
             lam: weight of the correction in each context; ignored by a pooled scheme.
         """
+        xp = namespace(lam)
         if self.pooled:
             share = n_unlabelled / (n + n_unlabelled)
-            return Mix(1 - share, jnp.full_like(lam, share), jnp.zeros_like(lam))
-        return Mix(jnp.ones_like(n), lam, lam)
+            return Mix(1 - share, xp.full_like(lam, share), xp.zeros_like(lam))
+        return Mix(xp.ones_like(n), lam, lam)
 
 
 SCHEMES: Final[dict[str, Scheme]] = {

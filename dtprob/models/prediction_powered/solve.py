@@ -2,11 +2,11 @@
 
 from typing import Final, NamedTuple
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Float
+import numpy as np
+from jaxtyping import Float
 
 from dtprob.errors import InputError
+from dtprob.models.prediction_powered.arrays import Values, compiled_for_jax, namespace
 from dtprob.models.prediction_powered.losses import AbstractLoss
 from dtprob.models.prediction_powered.moments import Evaluation, evaluate
 from dtprob.models.prediction_powered.sample import Sample
@@ -29,39 +29,40 @@ class Newton(NamedTuple):
         curvature: along each parameter.
     """
 
-    value: Float[Array, ""]
-    step: Float[Array, " parameter"]
-    decrement: Float[Array, ""]
-    condition: Float[Array, ""]
-    curvature: Float[Array, " parameter"]
+    value: Float[Values, ""]
+    step: Float[Values, " parameter"]
+    decrement: Float[Values, ""]
+    condition: Float[Values, ""]
+    curvature: Float[Values, " parameter"]
 
 
-@eqx.filter_jit
+@compiled_for_jax
 def newton(evaluation: Evaluation, mix: Mix) -> Newton:
     """The Newton step at an evaluation; directions of negative curvature are followed downhill."""
     labelled, unlabelled, predicted = evaluation.labelled, evaluation.unlabelled, evaluation.predicted
+    xp = namespace(evaluation.gradient)
 
-    def total(part: str) -> Array:
-        corrected = jnp.tensordot(mix.unlabelled, getattr(unlabelled, part), 1)
+    def total(part: str) -> Values:
+        corrected = xp.tensordot(mix.unlabelled, getattr(unlabelled, part), 1)
         return (
             mix.true * getattr(labelled, part)[0]
             + corrected
-            - jnp.tensordot(mix.predicted, getattr(predicted, part), 1)
+            - xp.tensordot(mix.predicted, getattr(predicted, part), 1)
         )
 
     gradient, hessian = total("gradient"), total("hessian")
-    diagonal = jnp.abs(jnp.diagonal(hessian))
-    scale = jnp.where(diagonal > 0, 1 / jnp.sqrt(diagonal), 1.0)
-    curvature, vectors = jnp.linalg.eigh(scale[:, None] * hessian * scale)
-    size = jnp.abs(curvature)
-    floor = jnp.finfo(size.dtype).eps * len(size)
-    step = scale * (vectors @ ((vectors.T @ (scale * gradient)) / jnp.maximum(size, floor)))
-    return Newton(total("value"), step, gradient @ step, jnp.min(size), diagonal)
+    diagonal = xp.abs(xp.diagonal(hessian))
+    scale = xp.where(diagonal > 0, 1 / xp.sqrt(diagonal), 1.0)
+    curvature, vectors = xp.linalg.eigh(scale[:, None] * hessian * scale)
+    size = xp.abs(curvature)
+    floor = xp.finfo(size.dtype).eps * len(size)
+    step = scale * (vectors @ ((vectors.T @ (scale * gradient)) / xp.maximum(size, floor)))
+    return Newton(total("value"), step, gradient @ step, xp.min(size), diagonal)
 
 
 def minimise(
-    loss: AbstractLoss, sample: Sample, mix: Mix, start: Evaluation, theta: Float[Array, " parameter"]
-) -> Float[Array, " parameter"]:
+    loss: AbstractLoss, sample: Sample, mix: Mix, start: Evaluation, theta: Float[Values, " parameter"]
+) -> Float[Values, " parameter"]:
     """The minimiser of the corrected loss.
 
     Args:
@@ -72,14 +73,16 @@ def minimise(
         theta: where to start.
 
     Raises:
-        InputError: the loss has no single minimiser (dependent features), or none at a finite place
+        InputError: the loss overflows at the start, has no single minimiser (dependent features), or none at a finite place
             (separable labels).
     """
-    tolerance = float(jnp.finfo(theta.dtype).eps)
+    if not _is_finite(start):
+        raise InputError("loss", "finite values at every sample", "infinity or NaN", "Scale the features")
+    tolerance = float(np.finfo(theta.dtype).eps)
     move = first = newton(start, mix)
     _check_condition(move, tolerance, len(theta))
     for _ in range(_MAX_STEPS):
-        if bool(jnp.any(move.curvature < _FLAT * first.curvature)):
+        if bool(np.any(move.curvature < _FLAT * first.curvature)):
             break
         if loss.traits.quadratic or float(move.decrement) <= tolerance:
             return theta - move.step
@@ -91,10 +94,10 @@ def minimise(
 
 
 def _descend(
-    loss: AbstractLoss, sample: Sample, mix: Mix, theta: Float[Array, " parameter"], move: Newton
-) -> tuple[Array, Newton]:
+    loss: AbstractLoss, sample: Sample, mix: Mix, theta: Float[Values, " parameter"], move: Newton
+) -> tuple[Values, Newton]:
     """Take the step, halved until the loss falls (or does not rise beyond rounding)."""
-    slack = 10 * float(jnp.finfo(theta.dtype).eps) * (1 + abs(float(move.value)))
+    slack = 10 * float(np.finfo(theta.dtype).eps) * (1 + abs(float(move.value)))
     length = 1.0
     for _ in range(_MAX_HALVINGS):
         candidate = theta - length * move.step
@@ -109,14 +112,19 @@ def _descend(
 
 
 def _evaluate_quietly(
-    loss: AbstractLoss, sample: Sample, theta: Float[Array, " parameter"]
+    loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"]
 ) -> Evaluation | None:
     """None where a step led so far that the loss overflows."""
     try:
         evaluation = evaluate(loss, sample, theta)
     except InputError:
         return None
-    return evaluation if bool(jnp.isfinite(evaluation.labelled.value[0])) else None
+    return evaluation if _is_finite(evaluation) else None
+
+
+def _is_finite(evaluation: Evaluation) -> bool:
+    """Whether loss, gradient and second derivative are finite on the labelled samples."""
+    return all(bool(np.isfinite(np.asarray(part)).all()) for part in evaluation.labelled[:3])
 
 
 def _check_condition(move: Newton, tolerance: float, dimension: int) -> None:

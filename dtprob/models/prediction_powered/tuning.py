@@ -9,13 +9,13 @@ arXiv 2405.15415). One lambda may serve all parameters or each its own, and all 
 from dataclasses import dataclass
 from typing import Final, Literal, NamedTuple, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dtprob.errors import InputError
-from dtprob.models.prediction_powered.moments import Evaluation
+from dtprob.models.prediction_powered.arrays import Values, compiled_for_jax, each, namespace
+from dtprob.models.prediction_powered.moments import Evaluation, Group
 
 type By = Literal["overall", "parameter", "context"]
 
@@ -72,20 +72,24 @@ class Lambda(NamedTuple):
         standard_error: of the closed form.
     """
 
-    value: Float[Array, "parameter context"]
-    raw: Float[Array, "parameter context"]
-    standard_error: Float[Array, "parameter context"]
+    value: Float[Values, "parameter context"]
+    raw: Float[Values, "parameter context"]
+    standard_error: Float[Values, "parameter context"]
 
 
 def fixed(lam: float, evaluation: Evaluation) -> Lambda:
     """A lambda that was given."""
     shape = evaluation.gradient.shape[1], evaluation.unlabelled.value.shape[0]
-    return Lambda(jnp.full(shape, lam), jnp.full(shape, lam), jnp.zeros(shape))
+    xp = namespace(evaluation.gradient)
+    return Lambda(xp.full(shape, lam), xp.full(shape, lam), xp.zeros(shape))
 
 
-@eqx.filter_jit
+@compiled_for_jax
 def tune(
-    evaluation: Evaluation, inverse: Float[Array, "parameter parameter"], by: By, practice: Practice = CAREFUL
+    evaluation: Evaluation,
+    inverse: Float[Values, "parameter parameter"],
+    by: By,
+    practice: Practice = CAREFUL,
 ) -> Lambda:
     """The lambda that minimises the mean square error, estimated.
 
@@ -100,102 +104,109 @@ def tune(
     if by != "context":
         evaluation = _merged(evaluation)
     if by == "parameter":
-        best = jax.vmap(lambda column: _tune(evaluation, column[:, None], practice))(inverse.T)
+        best = each(lambda column: _tune(evaluation, column[:, None], practice), inverse.T)
     else:
         best = _tune(evaluation, inverse, practice)
-    return Lambda(*(jnp.broadcast_to(part, (d, n_context)) for part in best))
+    xp = namespace(evaluation.gradient)
+    return Lambda(*(xp.broadcast_to(part, (d, n_context)) for part in best))
 
 
 def _merged(evaluation: Evaluation) -> Evaluation:
     """The data as if all contexts were one."""
-
-    def total(part: Array) -> Array:
-        return jnp.sum(part, axis=0, keepdims=True)
-
-    return evaluation._replace(
-        predicted=jax.tree.map(total, evaluation.predicted),
-        unlabelled=jax.tree.map(total, evaluation.unlabelled),
-        context=jnp.zeros_like(evaluation.context),
+    predicted, unlabelled = (
+        Group(*(part.sum(axis=0, keepdims=True) for part in group))
+        for group in (evaluation.predicted, evaluation.unlabelled)
     )
+    context = namespace(evaluation.context).zeros_like(evaluation.context)
+    return evaluation._replace(predicted=predicted, unlabelled=unlabelled, context=context)
 
 
-def _tune(evaluation: Evaluation, root: Float[Array, "parameter r"], practice: Practice) -> Lambda:
+def _tune(evaluation: Evaluation, root: Float[Values, "parameter r"], practice: Practice) -> Lambda:
     """Lambda per context for the error in the directions `root`."""
+    xp = namespace(evaluation.gradient)
     quadratic, linear, spread = _normal_equations(evaluation, root, practice)
-    diagonal = jnp.diagonal(quadratic)
+    diagonal = xp.diagonal(quadratic)
     usable = diagonal > 0
-    safe = quadratic + jnp.diag(jnp.where(usable, 0.0, 1.0))
-    raw = jnp.where(usable, jnp.linalg.solve(safe, linear), 0.0)
-    standard_error = jnp.where(usable, _standard_error(evaluation, root, safe, raw), 0.0)
-    value = _in_box(safe, linear) if len(linear) > 1 else raw
+    safe = quadratic + xp.diag(xp.where(usable, 0.0, 1.0))
+    raw = xp.where(usable, xp.linalg.solve(safe, linear), 0.0)
+    standard_error = xp.where(usable, _standard_error(evaluation, root, safe, raw), 0.0)
+    value = xp.asarray(_in_box(safe, linear)) if len(linear) > 1 else raw
     if practice.guard:
-        calibrated = jnp.where(usable, spread / jnp.diagonal(safe), 0.0)
+        calibrated = xp.where(usable, spread / xp.diagonal(safe), 0.0)
         value = _guarded(value, standard_error, calibrated)
-    return Lambda(jnp.clip(value, 0.0, 1.0), raw, standard_error)
+    return Lambda(xp.clip(value, 0.0, 1.0), raw, standard_error)
 
 
 def _normal_equations(
-    evaluation: Evaluation, root: Float[Array, "parameter r"], practice: Practice
-) -> tuple[Array, Array, Array]:
+    evaluation: Evaluation, root: Float[Values, "parameter r"], practice: Practice
+) -> tuple[Values, Values, Values]:
     """(A, b, diagonal of A without its unlabelled part) of the error lambda^T A lambda - 2 b^T lambda."""
+    xp = namespace(evaluation.gradient)
     g, f = projections(evaluation, root)
     n = evaluation.n
-    linear = jnp.einsum("nr,ncr->c", g, f) / n
-    spread = jnp.einsum("ncr,ndr->cd", f, f) / n
+    linear = xp.einsum("nr,ncr->c", g, f) / n
+    spread = xp.einsum("ncr,ndr->cd", f, f) / n
     unlabelled = unlabelled_covariance(evaluation, root)
     ratio = n / evaluation.n_unlabelled
     if practice.pooled_spread:
         pooled = _pooled(evaluation, root)
-        return (1 + ratio) * pooled, linear, jnp.diagonal(pooled)
-    return spread + ratio * unlabelled, linear, jnp.diagonal(spread)
+        return (1 + ratio) * pooled, linear, xp.diagonal(pooled)
+    return spread + ratio * unlabelled, linear, xp.diagonal(spread)
 
 
-def projections(evaluation: Evaluation, root: Float[Array, "parameter r"]) -> tuple[Array, Array]:
+def projections(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> tuple[Values, Values]:
     """Centred labelled gradients g (n, r) and f per context (n, context, r) along the directions `root`."""
-    n_context = evaluation.unlabelled.value.shape[0]
+    xp, n_context = namespace(evaluation.gradient), evaluation.unlabelled.value.shape[0]
     g = evaluation.gradient @ root
     f = evaluation.predicted_gradient @ root
-    inside = evaluation.context[:, None] == jnp.arange(n_context)
+    inside = evaluation.context[:, None] == xp.arange(n_context)
     f = inside[:, :, None] * f[:, None, :]
-    return g - jnp.mean(g, axis=0), f - jnp.mean(f, axis=0)
+    return g - g.mean(axis=0), f - f.mean(axis=0)
 
 
-def unlabelled_covariance(evaluation: Evaluation, root: Float[Array, "parameter r"]) -> Array:
+def unlabelled_covariance(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> Values:
     """Covariance between contexts of the unlabelled gradients, summed over directions, (context, context)."""
     mean = evaluation.unlabelled.gradient @ root
-    second = jnp.einsum("pr,cpq,qr->c", root, evaluation.unlabelled.second, root)
-    return jnp.diag(second) - mean @ mean.T
+    return namespace(mean).diag(_squares(evaluation, root)) - mean @ mean.T
 
 
-def _pooled(evaluation: Evaluation, root: Float[Array, "parameter r"]) -> Array:
+def _squares(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> Float[Values, " context"]:
+    """Mean squares of the unlabelled gradients, summed over directions."""
+    return (root * (evaluation.unlabelled.second @ root)).sum(axis=(1, 2))
+
+
+def _pooled(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> Values:
     """Covariance of labelled and unlabelled gradients taken together, as of one sample."""
+    xp = namespace(evaluation.gradient)
     n, count = evaluation.n, evaluation.n_unlabelled
     f = evaluation.predicted_gradient
     n_context = evaluation.unlabelled.value.shape[0]
-    inside = (evaluation.context[:, None] == jnp.arange(n_context)).astype(f.dtype)
+    inside = (evaluation.context[:, None] == xp.arange(n_context)).astype(f.dtype)
     mean = (count * evaluation.unlabelled.gradient + inside.T @ f) / (n + count) @ root
-    labelled = jnp.einsum("nc,nr->c", inside, (f @ root) ** 2)
-    second = count * jnp.einsum("pr,cpq,qr->c", root, evaluation.unlabelled.second, root) + labelled
-    return (jnp.diag(second) - (n + count) * (mean @ mean.T)) / (n + count - 1)
+    labelled = xp.einsum("nc,nr->c", inside, (f @ root) ** 2)
+    second = count * _squares(evaluation, root) + labelled
+    return (xp.diag(second) - (n + count) * (mean @ mean.T)) / (n + count - 1)
 
 
 def _standard_error(
     evaluation: Evaluation,
-    root: Float[Array, "parameter r"],
-    quadratic: Float[Array, "context context"],
-    raw: Float[Array, " context"],
-) -> Float[Array, " context"]:
+    root: Float[Values, "parameter r"],
+    quadratic: Float[Values, "context context"],
+    raw: Float[Values, " context"],
+) -> Float[Values, " context"]:
     """By the delta method over the labelled samples."""
+    xp = namespace(evaluation.gradient)
     g, f = projections(evaluation, root)
-    rest = g - jnp.einsum("ncr,c->nr", f, raw)
-    influence = jnp.einsum("nr,ncr->nc", rest, f)
-    influence = influence - jnp.mean(influence, axis=0)
+    rest = g - xp.einsum("ncr,c->nr", f, raw)
+    influence = xp.einsum("nr,ncr->nc", rest, f)
+    influence = influence - xp.mean(influence, axis=0)
     n = evaluation.n
-    covariance = influence.T @ influence / (n * jnp.maximum(n - 2, 1.0))
-    inverse = jnp.linalg.inv(quadratic)
-    return jnp.sqrt(jnp.maximum(jnp.diagonal(inverse @ covariance @ inverse), 0.0))
+    covariance = influence.T @ influence / (n * xp.maximum(n - 2, 1.0))
+    inverse = xp.linalg.inv(quadratic)
+    return xp.sqrt(xp.maximum(xp.diagonal(inverse @ covariance @ inverse), 0.0))
 
 
+@jax.jit
 def _in_box(quadratic: Float[Array, "context context"], linear: Float[Array, " context"]) -> Array:
     """The minimiser of lambda^T A lambda - 2 b^T lambda over [0, 1]^context, by coordinate descent."""
     diagonal = jnp.diagonal(quadratic)
@@ -210,9 +221,10 @@ def _in_box(quadratic: Float[Array, "context context"], linear: Float[Array, " c
     return jax.lax.fori_loop(0, _SWEEPS, sweep, jnp.clip(linear / diagonal, 0.0, 1.0))
 
 
-def _guarded(value: Array, standard_error: Array, calibrated: Array) -> Array:
-    anchor = jnp.where(value < calibrated / 2, 0.0, calibrated)
+def _guarded(value: Values, standard_error: Values, calibrated: Values) -> Values:
+    xp = namespace(value)
+    anchor = xp.where(value < calibrated / 2, 0.0, calibrated)
     distance = value - anchor
-    tiny = jnp.finfo(value.dtype).tiny
-    kept = jnp.maximum(0.0, 1 - standard_error**2 / jnp.maximum(distance**2, tiny))
-    return anchor + distance * jnp.where(standard_error > 0, kept, 1.0)
+    tiny = xp.finfo(value.dtype).tiny
+    kept = xp.maximum(0.0, 1 - standard_error**2 / xp.maximum(distance**2, tiny))
+    return anchor + distance * xp.where(standard_error > 0, kept, 1.0)

@@ -13,7 +13,8 @@ KEY = jax.random.key(9)
 
 
 def test_resamples_are_of_the_right_size_and_spread():
-    counts = np.asarray(resample(KEY, 30, 2000))
+    random = np.random.default_rng(9)
+    counts = np.stack([resample(random, 30) for _ in range(2000)])
     np.testing.assert_array_equal(counts.sum(axis=1), 30)
     # Each count is binomial with variance 29/30; the mean over 60000 of them is known to 1%.
     assert counts.var() == pytest.approx(29 / 30, rel=0.04)
