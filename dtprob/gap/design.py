@@ -1,0 +1,170 @@
+"""Which measurement tells rival explanations apart: expected log Bayes factors of designs, and what they cost.
+
+Each rival predicts the rows of a design with a mean and, since its parameters and the nuisances are known to some extent
+only, a covariance. The expected log Bayes factor of a true rival over a false one is the divergence of their predictions,
+exact for linear Gaussian models; a design is as good as its worst pair of rivals.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from itertools import permutations
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+NEEDED: Final = 3.0
+"""Nats of expected evidence that count as telling rivals apart: odds of twenty to one."""
+MOST: Final = 1024
+"""Repeats after which a design counts as not resolving."""
+
+
+class Prediction(NamedTuple):
+    """What one rival says of a design's rows, in units of their noise.
+
+    Attributes:
+        mean: of each row, from an origin that all rivals share.
+        tangents: by which it moves with each uncertain parameter.
+        covariance: of these parameters, as the data so far leave them.
+    """
+
+    mean: Float[np.ndarray, " row"]
+    tangents: Float[np.ndarray, "row parameter"]
+    covariance: Float[np.ndarray, "parameter parameter"]
+
+
+class Design(NamedTuple):
+    """A measurement that could be made.
+
+    Attributes:
+        where: its coordinates, for the user.
+        cost: of making it once.
+        predictions: one for each rival.
+    """
+
+    where: Mapping[str, Any]
+    cost: float
+    predictions: tuple[Prediction, ...]
+
+
+class Ranked(NamedTuple):
+    """How far a design leads.
+
+    Attributes:
+        where: its coordinates.
+        repeats: how often it is to be made.
+        nats: worst expected log Bayes factor of a true rival over another after that.
+        cost: of all repeats.
+        resolves: whether that is enough.
+    """
+
+    where: Mapping[str, Any]
+    repeats: int
+    nats: float
+    cost: float
+    resolves: bool
+
+
+class _Pair(NamedTuple):
+    """Inner products of two rivals' predictions, which grow in proportion with repeats."""
+
+    distance: float
+    slope: np.ndarray
+    own: np.ndarray
+    other: np.ndarray
+    cross: np.ndarray
+
+
+def expected_evidence(truth: Prediction, rival: Prediction, repeats: int = 1) -> float:
+    """Expected log Bayes factor (nats) of the true rival over another, from a design made some times over.
+
+    Args:
+        truth: prediction of the true one.
+        rival: of the other.
+        repeats: how often each row is measured, with noise of its own.
+    """
+    return _divergence(_pair(truth, rival), repeats)
+
+
+def resolution(predictions: Sequence[Prediction], repeats: int = 1) -> float:
+    """The least expected log Bayes factor over all ordered pairs of rivals."""
+    return min(_divergence(pair, repeats) for pair in _pairs(predictions))
+
+
+def rank(designs: Sequence[Design], needed: float = NEEDED, most: int = MOST) -> list[Ranked]:
+    """Designs by what it costs until they tell all rivals apart; those that never do come last, by what they reach.
+
+    Args:
+        designs: the candidates.
+        needed: nats that are enough.
+        most: repeats beyond which no design is followed.
+    """
+    found = [_repeated(design, needed, most) for design in designs]
+    return sorted(found, key=lambda one: (not one.resolves, one.cost if one.resolves else -one.nats))
+
+
+def joined(designs: Sequence[Design], where: Mapping[str, Any]) -> Design:
+    """Several designs as one that makes them all; rivals' predictions have the same parameters in each.
+
+    Args:
+        designs: one or more.
+        where: the coordinates of the whole.
+    """
+    rivals = zip(*(design.predictions for design in designs), strict=True)
+    predictions = tuple(
+        Prediction(
+            np.concatenate([part.mean for part in parts]),
+            np.concatenate([part.tangents for part in parts]),
+            parts[0].covariance,
+        )
+        for parts in rivals
+    )
+    return Design(where, sum(design.cost for design in designs), predictions)
+
+
+def _repeated(design: Design, needed: float, most: int) -> Ranked:
+    """The fewest repeats that are enough; evidence never falls with them."""
+    pairs = list(_pairs(design.predictions))
+
+    def reached(repeats: int) -> float:
+        return min(_divergence(pair, repeats) for pair in pairs)
+
+    if reached(most) < needed:
+        return Ranked(design.where, most, reached(most), most * design.cost, resolves=False)
+    low, high = 0, 1
+    while reached(high) < needed:
+        low, high = high, min(2 * high, most)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if reached(middle) >= needed else (middle, high)
+    return Ranked(design.where, high, reached(high), high * design.cost, resolves=True)
+
+
+def _pairs(predictions: Sequence[Prediction]) -> Iterator[_Pair]:
+    return (_pair(truth, rival) for truth, rival in permutations(predictions, 2))
+
+
+def _pair(truth: Prediction, rival: Prediction) -> _Pair:
+    difference = truth.mean - rival.mean
+    own, other = (each.tangents @ _root(each.covariance) for each in (truth, rival))
+    return _Pair(
+        float(difference @ difference), other.T @ difference, own.T @ own, other.T @ other, other.T @ own
+    )
+
+
+def _root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
+    values, vectors = np.linalg.eigh((covariance + covariance.T) / 2)
+    return vectors * np.sqrt(np.maximum(values, 0.0))
+
+
+def _divergence(pair: _Pair, repeats: int) -> float:
+    """Of N(m, I + U U') from N(m', I + V V'), with U, V and the means repeated, by Woodbury's identity."""
+    n = repeats
+    grown = np.eye(len(pair.other)) + n * pair.other
+    shrink = np.linalg.inv(grown)
+    distance = n * pair.distance - n**2 * pair.slope @ shrink @ pair.slope
+    spread = n * np.trace(pair.own) - n * np.sum(shrink * pair.other)
+    spread -= n**2 * np.einsum("ij,ik,jk->", shrink, pair.cross, pair.cross)
+    own = np.linalg.slogdet(np.eye(len(pair.own)) + n * pair.own)[1]
+    return max(0.0, 0.5 * float(distance + spread + np.linalg.slogdet(grown)[1] - own))
