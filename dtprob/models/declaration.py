@@ -26,6 +26,7 @@ type Data = Mapping[str, Any]
 type Kind = Literal["latent", "deterministic", "observed"]
 
 _METADATA = "__dtprob__"
+_ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
 @dataclass(frozen=True)
@@ -169,8 +170,11 @@ def select_arguments(function: Model, data: Data) -> dict[str, Any]:
 
 
 def split_static(data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Data as (arrays, everything else), so that arrays can be arguments of compiled functions."""
-    arrays, static = eqx.partition(dict(data), eqx.is_array_like)
+    """Data as (arrays, everything else), so that arrays can be arguments of compiled functions.
+
+    Plain numbers are settings: a model may size a plate by them.
+    """
+    arrays, static = eqx.partition(dict(data), lambda entry: isinstance(entry, _ARRAYS))
     return cast("dict[str, Any]", arrays), cast("dict[str, Any]", static)
 
 

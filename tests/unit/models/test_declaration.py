@@ -4,6 +4,7 @@ import functools
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
@@ -67,10 +68,21 @@ def test_names_of_axes():
 
 def test_arrays_and_settings_come_apart():
     arrays, static = split_static(DATA)
-    assert {name for name, value in arrays.items() if value is not None} == {"x", "degree", "y"}
-    assert all(value is None for value in static.values())
+    assert {name for name, value in arrays.items() if value is not None} == {"x", "y"}
+    assert {name: value for name, value in static.items() if value is not None} == {"degree": DATA["degree"]}
     _, words = split_static({**DATA, "phase": "coherent"})
     assert words["phase"] == "coherent"
+
+
+def grouped(group, groups, y=None):
+    level = numpyro.sample("level", dist.Normal(0, 1).expand([groups]))
+    with numpyro.plate("row", len(group)):
+        numpyro.sample("y", dist.Normal(level[group], 1.0), obs=y)
+
+
+def test_a_number_among_the_data_may_size_a_site():
+    data = {"group": np.array([0, 1, 2, 2]), "groups": 3, "y": np.zeros(4)}
+    assert declare(grouped, data).sites["level"].shape == (3,)
 
 
 def test_substituted_sites_have_their_values():
