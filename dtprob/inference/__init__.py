@@ -6,6 +6,7 @@ whose draws are laid out (chain, draw, *event). `fit` takes the engine's name in
 
 from dtprob.inference.auto import Auto, choose
 from dtprob.inference.blackjax_nuts import BlackJAXNUTS
+from dtprob.inference.each import fit_each
 from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.ensemble import Ensemble
 from dtprob.inference.exact import Exact
@@ -38,6 +39,7 @@ __all__ = [
     "VonMisesEM",
     "choose",
     "fit",
+    "fit_each",
     "resolve",
     "summary",
 ]

@@ -48,14 +48,14 @@ def assemble(
     """
     chains, draws = positions.shape[:2]
     shapes = jax.eval_shape(target.compiled(Target.evaluate), positions[0, 0], inputs)
-    kept, left_out = _kept_sites(target, shapes, options, chains * draws)
-    pushed = [_pushed(target, inputs, np.asarray(chain), kept, _block_size(shapes)) for chain in positions]
+    kept, left_out = kept_sites(target, shapes, options, chains * draws)
+    pushed = [_pushed(target, inputs, np.asarray(chain), kept, block_size(shapes)) for chain in positions]
     values, pointwise, lp = jax.tree.map(lambda *parts: np.stack(parts), *pushed)
     declaration = target.declaration
     sites = [name for name in declaration.sites if name in values]
     return Posterior(
         draws={name: values[name] for name in sites},
-        sample_stats=_independent_stats(lp) | dict(stats or {}),
+        sample_stats=independent_stats(lp) | dict(stats or {}),
         log_likelihood=pointwise,
         observed=observed_data(target, inputs),
         axes={name: site.axes for name, site in declaration.sites.items()},
@@ -109,7 +109,8 @@ def _plain(value: Any) -> Any:
     return value if isinstance(value, str | int | float | bool | None) else np.asarray(value).tolist()
 
 
-def _independent_stats(lp: np.ndarray) -> dict[str, np.ndarray]:
+def independent_stats(lp: np.ndarray) -> dict[str, np.ndarray]:
+    """The statistics of independent draws of these log densities."""
     return {
         "lp": lp,
         "energy": -lp,
@@ -120,12 +121,10 @@ def _independent_stats(lp: np.ndarray) -> dict[str, np.ndarray]:
     }
 
 
-type _Kept = tuple[tuple[str, ...], tuple[str, ...]]
+type Kept = tuple[tuple[str, ...], tuple[str, ...]]
 
 
-def _kept_sites(
-    target: Target, shapes: Evaluation, options: RunOptions, draws: int
-) -> tuple[_Kept, list[str]]:
+def kept_sites(target: Target, shapes: Evaluation, options: RunOptions, draws: int) -> tuple[Kept, list[str]]:
     """(value sites, pointwise sites) to keep, and the names left out for their size."""
     values, pointwise, left_out = [], [], []
     for name, site in target.declaration.sites.items():
@@ -139,31 +138,33 @@ def _kept_sites(
     return (tuple(values), tuple(pointwise)), left_out
 
 
-def _block_size(shapes: Evaluation) -> int:
+def block_size(shapes: Evaluation) -> int:
     """How many draws to evaluate at once, within bounds of memory; the same however many draws there are."""
     entries = sum(x.size for x in jax.tree.leaves((shapes.values, shapes.log_likelihood)))
     return max(1, min(_BLOCK, _BLOCK_ENTRIES // max(entries, 1)))
 
 
 def _pushed(
-    target: Target, inputs: Inputs, positions: Float[np.ndarray, "draw dimension"], kept: _Kept, block: int
+    target: Target, inputs: Inputs, positions: Float[np.ndarray, "draw dimension"], kept: Kept, block: int
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Float[np.ndarray, " draw"]]:
     """A chain's draws pushed through the model by one program of one shape.
 
     Programs of other shapes round otherwise, and a draw shall not depend on how many there are.
     """
-    push = target.compiled(_push, kept)
+    through = target.compiled(push, kept)
     padded = np.concatenate([positions, np.repeat(positions[-1:], -len(positions) % block, axis=0)])
     blocks = [
-        jax.tree.map(np.asarray, push(padded[begin : begin + block], inputs))
+        jax.tree.map(np.asarray, through(padded[begin : begin + block], inputs))
         for begin in range(0, len(padded), block)
     ]
     return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(positions)], *blocks)
 
 
-def _push(
-    target: Target, kept: _Kept, positions: Float[Array, "draw dimension"], inputs: Inputs
+def push(
+    target: Target, kept: Kept, positions: Float[Array, "draw dimension"], inputs: Inputs
 ) -> tuple[dict[str, Array], dict[str, Array], Float[Array, " draw"]]:
+    """Values, pointwise log likelihoods and log density of each draw."""
+
     def one(u: Float[Array, " dimension"]) -> tuple[dict[str, Array], dict[str, Array], Array]:
         run = target.evaluate(u, inputs)
         values = {name: run.values[name] for name in kept[0]}

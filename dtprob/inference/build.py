@@ -45,10 +45,11 @@ def build_target(model: Model, data: Data) -> tuple[Target, Inputs]:
     target = _TARGETS.get(model, arrays, static)
     bare = Inputs(arrays, jnp.zeros(target.dimension), jnp.ones(target.dimension))
     draws = target.compiled(Target.prior_draws)(jax.random.key(0), bare, {})
-    return target, Inputs(arrays, *_prior_units(target, np.asarray(draws)))
+    return target, Inputs(arrays, *prior_units(target, np.asarray(draws)))
 
 
-def _prior_units(target: Target, draws: np.ndarray) -> tuple[Array, Array]:
+def prior_units(target: Target, draws: np.ndarray) -> tuple[Array, Array]:
+    """Location and scale of each coordinate, from draws of the prior, (draw, ..., dimension)."""
     with np.errstate(invalid="ignore"):
         low, middle, high = np.quantile(draws, [0.25, 0.5, 0.75], axis=0)
         spread = (high - low) / _NORMAL_IQR

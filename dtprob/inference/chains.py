@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
@@ -29,18 +29,31 @@ class Walk:
         method: chains one after the other, or side by side.
         explore: steps before the angles' windows are centred; 0 without angles.
         warmup: steps in all that are not kept.
+        own: the arrays of the data of which each chain has its own, stacked on a leading axis, and then also its own
+            units; none where all chains are of one posterior. Such chains run side by side.
     """
 
     kernel: Kernel
     method: ChainMethod
     explore: int
     warmup: int
+    own: tuple[str, ...] = ()
 
-    def over_chains(self, function: Callable[..., Any], *stacked: Any) -> Any:
-        """`function` for each chain, arguments and results stacked on a leading axis."""
+    def over_chains(self, function: Callable[..., Any], inputs: Inputs, *stacked: Any) -> Any:
+        """`function(inputs, ...)` for each chain, arguments and results stacked on a leading axis."""
+        if self.own:
+            axes = stacked_axes(inputs, self.own)
+            return jax.vmap(function, in_axes=(axes, *[0] * len(stacked)))(inputs, *stacked)
         if self.method == "vectorized":
-            return jax.vmap(function)(*stacked)
-        return jax.lax.map(lambda arguments: function(*arguments), stacked)
+            return jax.vmap(functools.partial(function, inputs))(*stacked)
+        return jax.lax.map(lambda arguments: function(inputs, *arguments), stacked)
+
+
+def stacked_axes(inputs: Inputs, own: Sequence[str]) -> Any:
+    """Inputs with the axis that each part is stacked on, None where it is shared: an argument of `jax.vmap`."""
+    arrays: dict[str, Any] = {name: 0 if name in own else None for name in inputs.arrays}
+    stacked: Any = 0
+    return Inputs(arrays, stacked, stacked)
 
 
 class Chain(NamedTuple):
@@ -66,24 +79,24 @@ def start(
 ) -> Chain:
     """The chains at their starting points, nothing adapted yet."""
 
-    def one(point: Array, key: PRNGKeyArray) -> Chain:
+    def one(inputs: Inputs, point: Array, key: PRNGKeyArray) -> Chain:
         centre = point[target.angles]
         state = walk.kernel.init(target, jax.random.fold_in(key, START), point, Place(centre, inputs))
         return Chain(state, centre, jnp.zeros((*centre.shape, 2), point.dtype))
 
-    return walk.over_chains(one, points, keys)
+    return walk.over_chains(one, inputs, points, keys)
 
 
-def recentre(target: Target, walk: Walk, chains: Chain) -> Chain:
+def recentre(target: Target, walk: Walk, chains: Chain, inputs: Inputs) -> Chain:
     """The chains with windows centred on their mean directions so far; what is adapted stays."""
 
-    def one(chain: Chain) -> Chain:
+    def one(_: Inputs, chain: Chain) -> Chain:
         centre = jnp.arctan2(chain.resultant[:, 1], chain.resultant[:, 0])
         point = walk.kernel.position(chain.kernel)
         point = point.at[target.angles].set(recentred(point[target.angles], centre))
         return _shifted(target, walk, chain, point, centre)
 
-    return walk.over_chains(one, chains)
+    return walk.over_chains(one, inputs, chains)
 
 
 def advance(  # noqa: PLR0917  (settings first, since they are bound before compilation)
@@ -103,7 +116,7 @@ def advance(  # noqa: PLR0917  (settings first, since they are bound before comp
         first end - begin are filled.
     """
 
-    def one(chain: Chain, key: PRNGKeyArray) -> tuple[Chain, dict[str, Array]]:
+    def one(inputs: Inputs, chain: Chain, key: PRNGKeyArray) -> tuple[Chain, dict[str, Array]]:
         def body(number: Array, carry: tuple[Chain, dict[str, Array]]) -> tuple[Chain, dict[str, Array]]:
             moved, row = _step(target, walk, carry[0], jax.random.fold_in(key, number), number, inputs)
             return moved, jax.tree.map(lambda block, x: block.at[number - begin].set(x), carry[1], row)
@@ -112,7 +125,7 @@ def advance(  # noqa: PLR0917  (settings first, since they are bound before comp
         empty = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
         return jax.lax.fori_loop(begin, end, body, (chain, empty))
 
-    return walk.over_chains(one, chains, jax.vmap(jax.random.fold_in, (0, None))(keys, STEP))
+    return walk.over_chains(one, inputs, chains, jax.vmap(jax.random.fold_in, (0, None))(keys, STEP))
 
 
 def _step(  # noqa: PLR0917

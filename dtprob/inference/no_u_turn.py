@@ -57,10 +57,13 @@ class AbstractNoUTurn(AbstractEngine):
     def kernel(self, warmup: int) -> Kernel:
         """The transition, which adapts itself in the first `warmup` steps."""
 
+    def schedule(self) -> Schedule:
+        """How long a run is."""
+        enough = Enough(self.enough_ess, self.enough_rhat)
+        return Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial, enough)
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        enough = Enough(self.enough_ess, self.enough_rhat)
-        schedule = Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial, enough)
-        return run_chains(self, self.kernel, schedule, key, model=model, data=data, options=options)
+        return run_chains(self, self.kernel, self.schedule(), key, model=model, data=data, options=options)

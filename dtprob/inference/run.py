@@ -32,6 +32,8 @@ from dtprob.inference.progress import Progress
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model
 
+COUNTS = {"chains": 1, "warmup": 0, "draws": 1, "max_tree_depth": 1}
+"""The least that settings of a chain engine can be."""
 _EXPLORE_SHARE = 5
 _ROWS = 100  # steps per call of the compiled function, whatever the chunk
 
@@ -61,6 +63,11 @@ class Schedule:
         """All steps of a chain."""
         return self.warmup + self.draws
 
+    def walk(self, target: Target, kernel_for: Callable[[int], Kernel], own: tuple[str, ...] = ()) -> Walk:
+        """How the chains move; `own` as in `Walk`."""
+        explore = self.warmup // _EXPLORE_SHARE if target.angles.size else 0
+        return Walk(kernel_for(self.warmup), self.method, explore, self.warmup, own)
+
 
 def run_chains(
     engine: AbstractEngine,
@@ -86,19 +93,29 @@ def run_chains(
     Raises:
         InputError: see `build_target`; or the checkpoint is another run's.
     """
-    check_counts(engine, {"chains": 1, "warmup": 0, "draws": 1, "max_tree_depth": 1})
+    check_counts(engine, COUNTS)
     check_key(key)
     target, inputs = build_target(model, data)
-    explore = schedule.warmup // _EXPLORE_SHARE if target.angles.size else 0
-    walk = Walk(kernel_for(schedule.warmup), schedule.method, explore, schedule.warmup)
-    draws = _Loop(target, inputs, walk, schedule, key, options, engine).run()
+    walk = schedule.walk(target, kernel_for)
+    keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(schedule.chains))
+    draws = Loop(target, inputs, walk, schedule, key, options, engine).run(keys)
     positions = draws.pop("position")
     return assemble(target, inputs, positions, engine=engine, key=key, options=options, stats=draws)
 
 
 @dataclass
-class _Loop:
-    """The host's side of a run: the only place with side effects."""
+class Loop:
+    """The host's side of a run: the only place with side effects.
+
+    Attributes:
+        target: what the chains are of.
+        inputs: its arrays; those that `walk.own` names are stacked, one for each chain.
+        walk: how they move.
+        schedule: for how long.
+        key: the run's key, for its identity.
+        options: progress, checkpoint.
+        engine: who runs.
+    """
 
     target: Target
     inputs: Inputs
@@ -108,16 +125,19 @@ class _Loop:
     options: RunOptions
     engine: AbstractEngine
 
-    def run(self) -> dict[str, np.ndarray]:
-        """All draws and statistics by name, (chain, draw, ...)."""
-        keys = jax.vmap(jax.random.fold_in, (None, 0))(self.key, jnp.arange(self.schedule.chains))
+    def run(self, keys: PRNGKeyArray) -> dict[str, np.ndarray]:
+        """All draws and statistics by name, (chain, draw, ...).
+
+        Args:
+            keys: of each chain.
+        """
         wanted = self._wanted() if self.options.checkpoint else {}
         done, chains, kept = self._begin(keys, wanted)
         total = self.schedule.total
         with Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress:
             while done < total and not self._is_enough(done, kept):
                 if done == self.walk.explore > 0:
-                    chains = self._compiled(recentre)(chains)
+                    chains = self._compiled(recentre)(chains, self.inputs)
                 end = self._chunk_end(done)
                 chains, blocks = self._advance(chains, keys, done, end)
                 if done >= self.walk.warmup:
@@ -180,18 +200,17 @@ class _Loop:
         """For each chain the initial values, or the best of a few prior draws."""
         values = self.target.latent_values(self.schedule.initial or {})
         starts = 1 if len(values) == len(self.target.coordinates) else 2
-        points = [
-            starting_points(
-                self.target,
-                self.inputs,
-                jax.random.fold_in(key, START),
-                objective="density",
-                values=values,
-                starts=starts,
-            )[-1]
-            for key in keys
-        ]
-        return jnp.stack(points)
+
+        def one(inputs: Inputs, key: PRNGKeyArray) -> Array:
+            start_key = jax.random.fold_in(key, START)
+            found = starting_points(
+                self.target, inputs, start_key, objective="density", values=values, starts=starts
+            )
+            return found[-1]
+
+        if self.walk.own:
+            return self.walk.over_chains(one, self.inputs, keys)
+        return jnp.stack([one(self.inputs, key) for key in keys])
 
     def _save(
         self, wanted: Mapping[str, Any], done: int, chains: Chain, kept: list[dict[str, np.ndarray]]

@@ -27,10 +27,9 @@ _PARTS = ("real", "imag")
 def to_datatree(posterior: Posterior) -> xr.DataTree:
     """The posterior as a DataTree; see `Posterior.to_datatree`."""
     axes = posterior.axes
-    stats = dict.fromkeys(posterior.sample_stats, ())
     groups = {
         "posterior": _dataset(posterior.draws, axes, _LEADING, posterior.coords),
-        "sample_stats": _dataset(posterior.sample_stats, stats, _LEADING, {}),
+        "sample_stats": _dataset(posterior.sample_stats, axes, _LEADING, {}),
         "log_likelihood": _dataset(posterior.log_likelihood, axes, _LEADING, posterior.coords),
         "observed_data": _dataset(posterior.observed, axes, (), posterior.coords),
         "extra": _dataset(posterior.extra, {}, (), {}),

@@ -1,0 +1,192 @@
+"""One model on many small data sets: all their chains side by side in one program."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from dtprob.errors import InputError, unknown_name
+from dtprob.inference.assemble import (
+    Kept,
+    block_size,
+    independent_stats,
+    kept_sites,
+    observed_data,
+    provenance,
+    push,
+)
+from dtprob.inference.build import build_target, prior_units
+from dtprob.inference.chains import stacked_axes
+from dtprob.inference.engine import DEFAULT, AbstractEngine, RunOptions, check_counts, check_key
+from dtprob.inference.fit import resolve
+from dtprob.inference.no_u_turn import AbstractNoUTurn
+from dtprob.inference.posterior import Posterior, Values
+from dtprob.inference.run import COUNTS, Loop
+from dtprob.inference.target import Inputs, Target
+from dtprob.models.declaration import Model
+
+
+def fit_each(
+    model: Model,
+    data: Mapping[str, Any],
+    own: Sequence[str],
+    *,
+    axis: str = "member",
+    engine: str | AbstractNoUTurn = "nuts",
+    key: jax.Array,
+    options: RunOptions = DEFAULT,
+    **settings: Any,
+) -> Posterior:
+    """Infer a model's latent sites from each of many data sets of the same shapes, apart from each other.
+
+    Each has chains, a step size and a mass matrix of its own, as if `fit` had been called for each with the keys
+    fold_in(key, 0), fold_in(key, 1), ...: the same draws but for rounding. In one program it costs a small part of that.
+
+    Args:
+        model: a NumPyro model.
+        data: its arguments by name.
+        own: those of which each data set has its own, stacked on a leading axis; the others are shared.
+        axis: name of that axis in the posterior, where it follows the chains and draws: (chain, draw, member, *event).
+        engine: "nuts" or "blackjax_nuts", by name or set up.
+        key: typed JAX key.
+        options: progress, what to keep; there is no checkpoint.
+        settings: the engine's own, such as `draws`.
+
+    Raises:
+        InputError: see `fit`; or an engine without chains, an early stop, a checkpoint, or stacks of several lengths.
+    """
+    chosen = replace(_checked(resolve(engine, **settings), options), chain_method="vectorized")
+    check_key(key)
+    count = _count(data, own)
+    target, members = _members(model, data, own, count)
+    chains = np.repeat(np.arange(count), chosen.chains)
+    schedule = chosen.schedule()
+    walk = schedule.walk(target, chosen.kernel, tuple(own))
+    each = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(count))
+    numbers = jnp.arange(chosen.chains)
+    keys = jax.vmap(lambda k: jax.vmap(jax.random.fold_in, (None, 0))(k, numbers))(each).reshape(-1)
+    found = Loop(target, _taken(members, own, chains), walk, schedule, key, options, chosen).run(keys)
+    drawn = {name: values.reshape(count, chosen.chains, *values.shape[1:]) for name, values in found.items()}
+    return _posterior(target, members, own, drawn, axis=axis, engine=chosen, key=key, options=options)
+
+
+def _checked(engine: AbstractEngine, options: RunOptions) -> AbstractNoUTurn:
+    what = f"fit_each with engine {engine.name}"
+    if not isinstance(engine, AbstractNoUTurn):
+        remedy = "Call fit for each data set; what is compiled for the first serves the others"
+        raise InputError(what, "nuts or blackjax_nuts", engine.name, remedy)
+    check_counts(engine, COUNTS)
+    if engine.enough_ess:
+        raise InputError(what, "no early stop", f"enough_ess {engine.enough_ess}", "Leave enough_ess at 0")
+    if options.checkpoint is not None:
+        raise InputError(what, "no checkpoint", str(options.checkpoint), "Fit fewer data sets at once")
+    return engine
+
+
+def _count(data: Mapping[str, Any], own: Sequence[str]) -> int:
+    """How many data sets there are."""
+    for name in own:
+        if name not in data:
+            raise unknown_name("own of fit_each", name, data, "argument")
+    leaves = jax.tree.leaves([data[name] for name in own])
+    lengths = {np.shape(leaf)[:1] for leaf in leaves}
+    if len(lengths) != 1 or lengths <= {(), (0,)}:
+        got = ", ".join(str(length[0]) if length else "a scalar" for length in sorted(lengths)) or "nothing"
+        remedy = "Stack the data sets on the first axis of each of their arrays"
+        raise InputError("arrays named in own of fit_each", "one common length, 1 or more", got, remedy)
+    return int(np.shape(leaves[0])[0])
+
+
+def _members(model: Model, data: Mapping[str, Any], own: Sequence[str], count: int) -> tuple[Target, Inputs]:
+    """The target of any of the data sets, and their inputs: own arrays and units stacked."""
+    first = {n: jax.tree.map(lambda x: np.asarray(x)[0], v) if n in own else v for n, v in data.items()}
+    target, inputs = build_target(model, first)
+    stacked = {name: jax.tree.map(jnp.asarray, data[name]) for name in own}
+    bare = Inputs(inputs.arrays | stacked, *(jnp.zeros((count, target.dimension)) + i for i in range(2)))
+    keys = jnp.broadcast_to(jax.random.key(0), (count,))
+    draws = target.compiled(_prior_draws, tuple(own))(keys, bare)
+    return target, Inputs(bare.arrays, *prior_units(target, np.moveaxis(np.asarray(draws), 0, 1)))
+
+
+def _prior_draws(target: Target, own: tuple[str, ...], keys: Array, inputs: Inputs) -> Array:
+    draw = functools.partial(target.prior_draws, values={})
+    return jax.vmap(draw, in_axes=(0, stacked_axes(inputs, own)))(keys, inputs)
+
+
+def _taken(inputs: Inputs, own: Sequence[str], index: Any) -> Inputs:
+    """The inputs of the data sets of these numbers, or of one."""
+    arrays = {n: jax.tree.map(lambda x: x[index], v) if n in own else v for n, v in inputs.arrays.items()}
+    return Inputs(arrays, inputs.location[index], inputs.scale[index])
+
+
+def _posterior(
+    target: Target,
+    inputs: Inputs,
+    own: Sequence[str],
+    drawn: dict[str, np.ndarray],
+    *,
+    axis: str,
+    engine: AbstractNoUTurn,
+    key: jax.Array,
+    options: RunOptions,
+) -> Posterior:
+    """The posterior of draws (member, chain, draw, ...), the members on an axis after the draws."""
+    positions = drawn.pop("position")
+    count, chains, draws, _ = positions.shape
+    first = _taken(inputs, own, 0)
+    shapes = jax.eval_shape(target.compiled(Target.evaluate), positions[0, 0, 0], first)
+    kept, left_out = kept_sites(target, shapes, options, count * chains * draws)
+    values, pointwise, lp = _pushed(target, inputs, tuple(own), positions, kept, block_size(shapes))
+    declaration = target.declaration
+    sites = [name for name in declaration.sites if name in values]
+    stats = independent_stats(lp) | {name: np.moveaxis(value, 0, 2) for name, value in drawn.items()}
+    observed = [observed_data(target, _taken(inputs, own, number)) for number in range(count)]
+    known = provenance(target, inputs, engine, key)
+    return Posterior(
+        draws={name: values[name] for name in sites},
+        sample_stats=stats,
+        log_likelihood=pointwise,
+        observed={name: np.stack([one[name] for one in observed]) for name in observed[0]},
+        axes=dict.fromkeys(stats, (axis,))
+        | {name: (axis, *site.axes) for name, site in declaration.sites.items()},
+        latent=tuple(target.coordinates),
+        circular=tuple(name for name in sites if declaration.sites[name].is_circular),
+        provenance=known | {"left_out": left_out, "own": list(own)},
+    )
+
+
+def _pushed(  # noqa: PLR0917
+    target: Target,
+    inputs: Inputs,
+    own: tuple[str, ...],
+    positions: Float[np.ndarray, "member chain draw dimension"],
+    kept: Kept,
+    block: int,
+) -> tuple[Values, Values, np.ndarray]:
+    """Values, pointwise log likelihoods and log densities, each (chain, draw, member, ...)."""
+    count, chains, draws, dimension = positions.shape
+    flat = positions.reshape(count, -1, dimension)
+    through = target.compiled(_push_each, kept, own)
+    blocks = [
+        jax.tree.map(np.asarray, through(flat[:, begin : begin + block], inputs))
+        for begin in range(0, flat.shape[1], block)
+    ]
+
+    def laid_out(*parts: np.ndarray) -> np.ndarray:
+        whole = np.concatenate(parts, axis=1)
+        return np.moveaxis(whole.reshape(count, chains, draws, *whole.shape[2:]), 0, 2)
+
+    return jax.tree.map(laid_out, *blocks)
+
+
+def _push_each(target: Target, kept: Kept, own: tuple[str, ...], positions: Array, inputs: Inputs) -> Any:
+    return jax.vmap(functools.partial(push, target, kept), in_axes=(0, stacked_axes(inputs, own)))(
+        positions, inputs
+    )
