@@ -68,15 +68,13 @@ class Neural(JaxPredictor):
         weight: Float[Array, " sample"],
     ) -> Any:
         """Location and scale of features and labels, and the parameters after the last step."""
-        scales = *standard(x, weight), *self._label_scale(y, weight)
+        scales = self.scales(x, y, weight)
         inputs = (x - scales[0]) / scales[1]
         targets = (y - scales[2]) / scales[3]
-        parameters = self.init(key, inputs)
-        schedule = optax.cosine_decay_schedule(self.step_size, self.steps)
-        optimiser = optax.adamw(schedule, weight_decay=self.decay)
+        parameters, optimiser = self.init(key, inputs), self.optimiser
 
         def objective(candidate: Any) -> Scalar:
-            return jnp.sum(weight * self._losses(candidate, inputs, targets)) / jnp.sum(weight)
+            return jnp.sum(weight * self.losses(candidate, inputs, targets)) / jnp.sum(weight)
 
         def step(state: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], None]:
             parameters, memory = state
@@ -94,16 +92,31 @@ class Neural(JaxPredictor):
         output = self._output(parameters, (x - scales[0]) / scales[1], jnp.shape(scales[2]))
         return jax.nn.sigmoid(output) if self.loss == "logistic" else output * scales[3] + scales[2]
 
-    def _label_scale(self, y: Float[Array, "sample ..."], weight: Float[Array, " sample"]) -> tuple[Any, Any]:
+    def scales(
+        self,
+        x: Float[Array, "sample feature"],
+        y: Float[Array, "sample ..."],
+        weight: Float[Array, " sample"],
+    ) -> tuple[Array, Array, Array, Array]:
+        """Location and scale of features and of labels; probabilities are left as they are."""
         if self.loss == "logistic":
-            return jnp.zeros(y.shape[1:], y.dtype), jnp.ones(y.shape[1:], y.dtype)
+            return *standard(x, weight), jnp.zeros(y.shape[1:], y.dtype), jnp.ones(y.shape[1:], y.dtype)
         location, scale = standard(y.reshape(len(y), -1), weight)
-        return location.reshape(y.shape[1:]), scale.reshape(y.shape[1:])
+        return *standard(x, weight), location.reshape(y.shape[1:]), scale.reshape(y.shape[1:])
+
+    @property
+    def optimiser(self) -> optax.GradientTransformation:
+        """Adam with weight decay and the cosine decay of its step size."""
+        schedule = optax.cosine_decay_schedule(self.step_size, self.steps)
+        return optax.adamw(schedule, weight_decay=self.decay)
 
     def _output(self, parameters: Any, x: Float[Array, "sample feature"], label: tuple[int, ...]) -> Array:
         return self.apply(parameters, x).reshape(len(x), *label)
 
-    def _losses(self, parameters: Any, x: Array, y: Array) -> Float[Array, " sample"]:
+    def losses(
+        self, parameters: Any, x: Float[Array, "sample feature"], y: Float[Array, "sample ..."]
+    ) -> Float[Array, " sample"]:
+        """The loss of each sample, features and labels scaled."""
         output = self._output(parameters, x, y.shape[1:])
         squared = (output - y) ** 2
         each = jax.nn.softplus(output) - y * output if self.loss == "logistic" else squared
