@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from types import MappingProxyType
 
 import jax
 import numpy as np
@@ -13,11 +15,13 @@ from dtprob.gap import closed
 from dtprob.gap.base import fit_base
 from dtprob.gap.compose import compose
 from dtprob.gap.confirm import confirm
+from dtprob.gap.design_data import next_measurement
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.problem import Problem
 from dtprob.gap.search import Say, alarmed, search
 from dtprob.gap.settings import Settings
+from dtprob.gap.shares import shares
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.declaration import Data, Model
@@ -35,6 +39,7 @@ def diagnose(
     cluster: str | None = None,
     settings: Settings = _DEFAULT,
     reference: Posterior | None = None,
+    designs: Mapping[str, Data] = MappingProxyType({}),
     say: Say = lambda _: None,
 ) -> Diagnosis:
     """Find out why data differ from a model.
@@ -49,6 +54,8 @@ def diagnose(
         settings: levels and effort.
         reference: posterior of the model on earlier data; it becomes the prior of the nuisances, so that a change of a
             parameter is a gap and not absorbed by a new fit.
+        designs: arguments of the model for measurements that could be made, by name; where causes cannot be told apart, the
+            report ranks them. Observed values in them are not looked at.
         say: receives one line at each stage, for progress.
 
     Raises:
@@ -69,7 +76,9 @@ def diagnose(
     evidence = _gather(problem, key, settings, say)
     causes = _causes(evidence, jax.random.fold_in(key, 7), engine, settings, say)
     verdict = decide(evidence, causes, settings)
-    return compose(evidence, causes, verdict, settings=settings, engine=engine, key=key)
+    found = compose(evidence, causes, verdict, settings=settings, engine=engine, key=key)
+    plan = next_measurement(evidence, causes, designs) if verdict == "UNDETERMINED" else None
+    return replace(found, sections={**found.sections, "next_measurement": plan})
 
 
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
@@ -90,7 +99,9 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     fraction = (
         closed.closed_fraction(held_before, held_after, bracket, keys[3]) if last.fitted.effects else None
     )
-    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction)
+    held = held_before, held_after
+    parts = shares(last.problem, last.fitted, held, assignment, keys[3]) if fraction is not None else ()
+    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts)
 
 
 def _causes(
@@ -105,9 +116,18 @@ def _causes(
     first = evidence.held_after.estimates
     strata = tuple(float(v) for v in next(iter(first.values()))[:, 0]) if first else ()
     physics = "; ".join(e.physics for e in effects if e.physics)
-    return (
-        Cause(evidence.accepted, classes, probability, sizes, evidence.fraction, physics, strata, plausible),
+    cause = Cause(
+        effects=evidence.accepted,
+        alias_class=classes,
+        probability=probability,
+        size=sizes,
+        closed_fraction=evidence.fraction,
+        shares=evidence.shares,
+        physics=physics,
+        strata=strata,
+        plausible=plausible,
     )
+    return (cause,)
 
 
 def alternatives(evidence: Evidence, settings: Settings) -> tuple[tuple[tuple[str, ...], ...], float]:
