@@ -155,14 +155,16 @@ def _electric(state: State, scene: Factors, source: Patches, drive: Array) -> St
     along_x = hy[1:, 1:-1] - hy[:-1, 1:-1]
     psi_y = _remember(memory[2], along_y, scene.magnetic, 1)
     psi_x = _remember(memory[3], along_x, scene.magnetic, 0)
-    inner = scene.keep * ez[1:-1, 1:-1] + scene.gain * (along_x - along_y)
-    inner = _add_ends(inner, -_ends(scene.gain, 1) * psi_y, 1)
-    inner = _add_ends(inner, _ends(scene.gain, 0) * psi_x, 0)
-    start = source.corner[0, 0] - 1, source.corner[0, 1] - 1
-    there = jax.lax.dynamic_slice(inner, start, (4, 4))
-    gain = jax.lax.dynamic_slice(scene.gain, start, (4, 4))
-    inner = jax.lax.dynamic_update_slice(inner, there + drive * gain * source.weight[0], start)
-    return State(jnp.pad(inner, 1), hx, hy, (*memory[:2], psi_y, psi_x))
+    ez = ez.at[1:-1, 1:-1].set(scene.keep * ez[1:-1, 1:-1] + scene.gain * (along_x - along_y))
+    low, high = jnp.split(-_ends(scene.gain, 1) * psi_y, 2, 1)
+    ez = ez.at[1:-1, 1 : ABSORBER + 1].add(low).at[1:-1, -ABSORBER - 1 : -1].add(high)
+    low, high = jnp.split(_ends(scene.gain, 0) * psi_x, 2, 0)
+    ez = ez.at[1 : ABSORBER + 1, 1:-1].add(low).at[-ABSORBER - 1 : -1, 1:-1].add(high)
+    start = source.corner[0, 0], source.corner[0, 1]
+    there = jax.lax.dynamic_slice(ez, start, (4, 4))
+    gain = jax.lax.dynamic_slice(scene.gain, (start[0] - 1, start[1] - 1), (4, 4))
+    ez = jax.lax.dynamic_update_slice(ez, there + drive * gain * source.weight[0], start)
+    return State(ez, hx, hy, (*memory[:2], psi_y, psi_x))
 
 
 def _averaged(difference: Float[Array, "a b"], axis: int) -> Float[Array, "a b"]:

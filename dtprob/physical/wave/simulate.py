@@ -60,7 +60,7 @@ class Cost(NamedTuple):
     Attributes:
         nodes: of the grid.
         steps: in time.
-        bytes: of the field and of the factors of a step; a step works on a second copy of the field.
+        bytes: of the field, of the factors of a step and of what a step needs for a while.
     """
 
     nodes: int
@@ -74,7 +74,7 @@ def cost(
     """What `simulate` with these arguments takes."""
     grid = _grid(scene, frequency, cells)
     nodes = grid.shape[0] * grid.shape[1]
-    return Cost(nodes, _steps(grid, duration), 4 * (3 + 4) * nodes)
+    return Cost(nodes, _steps(grid, duration), 4 * (3 + 4 + 3) * nodes)
 
 
 def simulate(
