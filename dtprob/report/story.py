@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.json_schema import Cause, Detectable, Report
@@ -47,19 +48,36 @@ def rivals(report: Report) -> list[list[str]]:
 
 
 def next_step(report: Report) -> str | None:
-    """The next measurement as one sentence, or None where there is none.
+    """The next measurement in a sentence or two, or None where there is none.
 
-    Besides text it may be a mapping with a `description`, or with a `design` (coordinates) and its `repeats`.
+    Besides text it may be a mapping with a `description`, or with a `design` (coordinates), its `repeats`, and whether it
+    `resolves`.
     """
     plan = report["next_measurement"]
     if not isinstance(plan, Mapping):
         return plan
     if "design" not in plan:
         return plan.get("description")
+    where = {axis: value for axis, value in plan["design"].items() if axis != "design"}
+    place = listing(f"{words(axis)} {detail(value)}" for axis, value in where.items())
+    offered = plan["design"].get("design")
+    place = f"{place} of the design {words(offered)}" if offered else place
+    if not plan.get("resolves", True):
+        return f"No measurement that is known of tells the explanations apart, however often made; {place} comes nearest."
     times = plan.get("repeats", 1)
-    where = listing(f"{words(axis)} {detail(value)}" for axis, value in plan["design"].items())
     many = f" {times} times" if times > 1 else ""
-    return f"Measure {where} again{many}: there the explanations differ most."
+    again = "" if offered else " again"
+    return f"Measure {place}{again}{many}: there the explanations differ most.{_saved(plan)}"
+
+
+def _saved(plan: Mapping[str, Any]) -> str:
+    """How much less that costs than everything again."""
+    everything = plan.get("cost_of_all_again")
+    if "cost" not in plan:
+        return ""
+    if everything is None:
+        return " Measuring everything again would not decide."
+    return f" Everything again would cost {everything / plan['cost']:.0f} times as much."
 
 
 def tell(report: Report) -> Story:

@@ -85,6 +85,19 @@ def test_next_step_is_made_from_a_design() -> None:
     assert next_step(report) == "Do it."
 
 
+def test_next_step_says_what_is_saved_and_what_does_not_help() -> None:
+    plan = {"design": {"design": "roof_sites", "link": 3}, "repeats": 1, "resolves": True, "cost": 1.0}
+    report: names.Any = {"next_measurement": {**plan, "cost_of_all_again": 12.0}}
+    said = next_step(report)
+    assert said is not None
+    assert said.startswith("Measure link 3 of the design roof sites: there the explanations differ most.")
+    assert said.endswith("Everything again would cost 12 times as much.")
+    report = {"next_measurement": {**plan, "cost_of_all_again": None}}
+    assert str(next_step(report)).endswith("Measuring everything again would not decide.")
+    report = {"next_measurement": {**plan, "resolves": False, "cost_of_all_again": None}}
+    assert str(next_step(report)).startswith("No measurement that is known of tells the explanations apart")
+
+
 def test_advice_reads_as_an_imperative() -> None:
     assert family("blockage[wall_3]") == "blockage"
     assert advice("blockage[wall_3]") == ADVICE["blockage"]
