@@ -15,7 +15,7 @@ from dtprob.inference.kernel import Kernel, Place, window_of
 from dtprob.inference.target import Inputs, Target
 from dtprob.inference.winding import recentred, redraw_winding
 
-type ChainMethod = Literal["sequential", "vectorized"]
+type ChainMethod = Literal["parallel", "vectorized"]
 
 START, STEP = 0, 1
 
@@ -26,7 +26,7 @@ class Walk:
 
     Attributes:
         kernel: the transition.
-        method: chains one after the other, or side by side.
+        method: "parallel" where each chain has calls of its own, "vectorized" where all are in one program.
         explore: steps before the angles' windows are centred; 0 without angles.
         warmup: steps in all that are not kept.
         own: the arrays of the data of which each chain has its own, stacked on a leading axis, and then also its own
@@ -57,7 +57,7 @@ def stacked_axes(inputs: Inputs, own: Sequence[str]) -> Any:
 
 
 class Chain(NamedTuple):
-    """State of one chain; all chains of a run are stacked on a leading axis.
+    """State of one chain; the chains of a call are stacked on a leading axis.
 
     Attributes:
         kernel: the kernel's own state.

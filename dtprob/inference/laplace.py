@@ -24,6 +24,8 @@ from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model
 
+COUNTS = {"draws": 1, "starts": 1, "max_steps": 1}
+"""The least that the settings can be."""
 LARGEST = 3000
 """Coordinates that a dense precision is kept for."""
 
@@ -76,7 +78,7 @@ class Laplace(AbstractEngine):
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, {"draws": 1, "starts": 1, "max_steps": 1})
+        check_counts(self, COUNTS)
         search_key, draw_key = jax.random.split(check_key(key))
         target, inputs = build_target(model, data)
         if target.dimension > LARGEST:

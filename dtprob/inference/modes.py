@@ -85,7 +85,7 @@ def find_mode(
     values = target.latent_values(initial or {})
     count = 1 if len(values) == len(target.coordinates) else starts
     points = starting_points(target, inputs, key, objective=objective, values=values, starts=count)
-    mode: Mode = target.compiled(_search, objective, max_steps)(points, inputs)
+    mode: Mode = target.compiled(search, objective, max_steps)(points, inputs)
     if not bool(jnp.isfinite(mode.optimum.value)):
         what = f"model {target.declaration.name}"
         remedy = "Give initial values, or check that the data are finite and within the model's supports"
@@ -93,13 +93,15 @@ def find_mode(
     return mode
 
 
-def _search(
+def search(
     target: Target,
     objective: Objective,
     max_steps: int,
     points: Float[Array, "start dimension"],
     inputs: Inputs,
 ) -> Mode:
+    """The lowest of the minima reached from these points, as a pure function; see `find_mode`."""
+
     def function(u: Array) -> Array:
         return objective_value(target, objective, u, inputs)
 

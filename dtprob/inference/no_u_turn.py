@@ -32,8 +32,8 @@ class AbstractNoUTurn(AbstractEngine):
         target_accept: acceptance rate that the step size is adapted to.
         max_tree_depth: bound on the doublings of a trajectory.
         dense_mass: adapt a full mass matrix rather than a diagonal one.
-        chain_method: "sequential" or "vectorized": chains one after the other, or side by side, which is
-            faster on a GPU but makes the last bits of a draw depend on the number of chains.
+        chain_method: "parallel" or "vectorized": each chain by itself, on as many cores as there are, or all in one
+            program, which is faster on a GPU but makes the last bits of a draw depend on the number of chains.
         initial: constrained values that every chain starts from; sites without one start from the prior.
         enough_ess: stop once every coordinate has this effective sample size and no r-hat above `enough_rhat`;
             0 makes all draws.
@@ -48,7 +48,7 @@ class AbstractNoUTurn(AbstractEngine):
     target_accept: float = 0.8
     max_tree_depth: int = 10
     dense_mass: bool = False
-    chain_method: ChainMethod = "sequential"
+    chain_method: ChainMethod = "parallel"
     initial: Mapping[str, Any] | None = None
     enough_ess: int = 0
     enough_rhat: float = 1.01

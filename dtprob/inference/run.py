@@ -8,7 +8,10 @@ on where chunks end, on an interruption, or on how many chains and draws there a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import functools
+import os
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -46,7 +49,8 @@ class Schedule:
         chains: number of chains.
         warmup: steps of each chain that are not kept.
         draws: steps of each chain that are.
-        method: chains one after the other ("sequential") or side by side ("vectorized").
+        method: each chain by calls of its own, on as many cores as there are ("parallel"), or all in one program
+            ("vectorized").
         initial: constrained values that the chains start from.
         enough: when to stop before all draws are made.
     """
@@ -132,20 +136,34 @@ class Loop:
             keys: of each chain.
         """
         wanted = self._wanted() if self.options.checkpoint else {}
-        done, chains, kept = self._begin(keys, wanted)
-        total = self.schedule.total
-        with Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress:
+        key_groups = self._grouped(keys)
+        done, groups, kept = self._begin(key_groups, wanted)
+        total, move = self.schedule.total, self._compiled(advance, _ROWS)
+        move(groups[0], key_groups[0], done, done, self.inputs)  # no step: compiled before threads ask for it
+        with (
+            ThreadPoolExecutor(min(len(groups), os.cpu_count() or 1)) as pool,
+            Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress,
+        ):
             while done < total and not self._is_enough(done, kept):
                 if done == self.walk.explore > 0:
-                    chains = self._compiled(recentre)(chains, self.inputs)
+                    groups = [self._compiled(recentre)(group, self.inputs) for group in groups]
                 end = self._chunk_end(done)
-                chains, blocks = self._advance(chains, keys, done, end)
+                advanced = functools.partial(self._advance, move, done, end)
+                found = list(pool.map(advanced, groups, key_groups))
+                groups = [group for group, _ in found]
                 if done >= self.walk.warmup:
-                    kept += blocks
+                    kept += [_stacked(blocks) for blocks in zip(*(b for _, b in found), strict=True)]
                 done = end
-                self._save(wanted, done, chains, kept)
+                self._save(wanted, done, groups, kept)
                 progress.report(done, "draws" if done > self.walk.warmup else "warmup", _note(kept))
         return _joined(kept)
+
+    def _grouped(self, stacked: Any) -> list[Any]:
+        """What is stacked by chain, in the groups that a call of the compiled functions serves: one chain, or all."""
+        together = self.walk.own or self.walk.method == "vectorized"
+        size = len(jax.tree.leaves(stacked)[0]) if together else 1
+        firsts = range(0, len(jax.tree.leaves(stacked)[0]), size)
+        return [jax.tree.map(lambda x, first=first: x[first : first + size], stacked) for first in firsts]
 
     def _wanted(self) -> dict[str, Any]:
         """What a checkpoint must be of; it may have fewer draws."""
@@ -155,10 +173,9 @@ class Loop:
         return self.target.compiled(function, self.walk, *settings)
 
     def _advance(
-        self, chains: Chain, keys: PRNGKeyArray, begin: int, end: int
+        self, move: Callable[..., Any], begin: int, end: int, chains: Chain, keys: PRNGKeyArray
     ) -> tuple[Chain, list[dict[str, np.ndarray]]]:
-        """The chains after steps `begin` to `end`, and these steps' rows, by one program for every chunk."""
-        move = self._compiled(advance, _ROWS)
+        """A group of chains after steps `begin` to `end`, and these steps' rows, by one program for every chunk."""
         blocks: list[dict[str, np.ndarray]] = []
         for first in range(begin, end, _ROWS):
             rows = min(_ROWS, end - first)
@@ -181,20 +198,24 @@ class Loop:
         return enough.reached(self.target, _joined(kept)["position"])
 
     def _begin(
-        self, keys: PRNGKeyArray, wanted: Mapping[str, Any]
-    ) -> tuple[int, Chain, list[dict[str, np.ndarray]]]:
+        self, keys: list[PRNGKeyArray], wanted: Mapping[str, Any]
+    ) -> tuple[int, list[Chain], list[dict[str, np.ndarray]]]:
         path = self.options.checkpoint
         begin = self._compiled(start)
         if not self.options.resume or path is None or not path.exists():
-            return 0, begin(self._starting_points(keys), keys, self.inputs), []
+            points = [self._starting_points(group) for group in keys]
+            return 0, [begin(at, group, self.inputs) for at, group in zip(points, keys, strict=True)], []
         found = checkpoint.read(path, wanted)
         if found.done > self.schedule.total:
             expected, got = f"at most {self.schedule.total} steps", str(found.done)
             raise InputError(f"checkpoint {path}", expected, got, "Ask for as many draws as it has, or more")
-        points = jax.ShapeDtypeStruct((self.schedule.chains, self.target.dimension), jnp.zeros(0).dtype)
-        like = jax.eval_shape(begin, points, keys, self.inputs)
+        points = jax.ShapeDtypeStruct((len(keys[0]), self.target.dimension), jnp.zeros(0).dtype)
+        like = jax.tree.map(
+            lambda x: jax.ShapeDtypeStruct((self.schedule.chains, *x.shape[1:]), x.dtype),
+            jax.eval_shape(begin, points, keys[0], self.inputs),
+        )
         chains: Chain = checkpoint.restore(found.state, like, f"checkpoint {path}")
-        return found.done, chains, [found.draws] if found.draws else []
+        return found.done, self._grouped(chains), [found.draws] if found.draws else []
 
     def _starting_points(self, keys: PRNGKeyArray) -> Float[Array, "chain dimension"]:
         """For each chain the initial values, or the best of a few prior draws."""
@@ -213,12 +234,17 @@ class Loop:
         return jnp.stack([one(self.inputs, key) for key in keys])
 
     def _save(
-        self, wanted: Mapping[str, Any], done: int, chains: Chain, kept: list[dict[str, np.ndarray]]
+        self, wanted: Mapping[str, Any], done: int, groups: list[Chain], kept: list[dict[str, np.ndarray]]
     ) -> None:
         if self.options.checkpoint is not None:
-            state = [np.asarray(leaf) for leaf in jax.tree.leaves(chains)]
+            state = [np.concatenate(leaves) for leaves in zip(*map(jax.tree.leaves, groups), strict=True)]
             snapshot = checkpoint.Snapshot(done, state, _joined(kept) if kept else {})
             checkpoint.write(self.options.checkpoint, wanted, snapshot)
+
+
+def _stacked(blocks: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """The rows of all groups, chain after chain."""
+    return {name: np.concatenate([block[name] for block in blocks]) for name in blocks[0]}
 
 
 def _joined(kept: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
