@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -63,12 +64,20 @@ class Extra:
 
     def score(self, values: jax.Array) -> np.ndarray:
         """Scores (n, parameter) of observed values (n, ...)."""
-        shift = jnp.asarray(self.shift)
+        null = self.null
+        return np.asarray(_scores(null.parameters, values, self.shift, family=null.family, first=self.first))
 
-        def one(value: jax.Array) -> jax.Array:
-            return whiten.residual(self.null, value)[self.first :].reshape(-1) @ shift
 
-        return np.asarray(quick_jit(lambda stacked: jax.lax.map(one, stacked))(values))
+@partial(quick_jit, static_argnames=("family", "first"))
+def _scores(
+    parameters: whiten.Parameters, values: jax.Array, shift: np.ndarray, *, family: str, first: int
+) -> jax.Array:
+    null = whiten.Observation(family, parameters)
+
+    def one(value: jax.Array) -> jax.Array:
+        return whiten.residual(null, value)[first:].reshape(-1) @ shift
+
+    return jax.lax.map(one, values)
 
 
 @dataclass(frozen=True)

@@ -65,11 +65,15 @@ class Projection:
         moved = jnp.einsum("cmg,g->cm", self.columns, self.shared.deviation)
         return residual + moved + jnp.einsum("cml,cl->cm", self.local_columns, self.own.deviation)
 
-    def with_prior(self, rows: jax.Array, key: jax.Array) -> jax.Array:
-        """Rows (replicate, cluster, row) to which the prior's spread of all coordinates is added."""
-        keys, n = jax.random.split(key), len(rows)
-        shared = jax.random.normal(keys[0], (n, *self.shared.spread.shape)) * self.shared.spread
-        own = jax.random.normal(keys[1], (n, *self.own.spread.shape)) * self.own.spread
+    def with_prior(self, rows: jax.Array, keys: jax.Array) -> jax.Array:
+        """Rows (replicate, cluster, row) to which the prior's spread of all coordinates is added, by replicates' keys."""
+
+        def drawn(which: int, spread: np.ndarray) -> jax.Array:
+            return jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, which), spread.shape))(keys)
+
+        shared, own = (
+            drawn(which, part.spread) * part.spread for which, part in enumerate((self.shared, self.own))
+        )
         rows = rows + jnp.einsum("cmg,rg->rcm", self.columns, shared)
         return rows + jnp.einsum("cml,rcl->rcm", self.local_columns, own)
 

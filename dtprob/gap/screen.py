@@ -18,6 +18,7 @@ from scipy import stats
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.active import activate
+from dtprob.gap.bootstrap import Replicates
 from dtprob.gap.directions import Tangents, surroundings, tangents
 from dtprob.gap.fields import field_tests
 from dtprob.gap.plausible import log_bayes_factor, scales
@@ -63,40 +64,6 @@ class Screening:
     detectable: np.ndarray
     correlation: np.ndarray
     replicate_p: np.ndarray
-
-
-@dataclass(frozen=True)
-class Replicates:
-    """Data sets drawn at a fit, the nuisances refitted to first order, and what they say at the sites.
-
-    Attributes:
-        raw: rows of the data (cluster, row), as if nothing had been fitted.
-        observed: projected rows of the data (cluster, row).
-        rows: whitened rows of the replicates (replicate, cluster, row), not projected.
-        values: observed values of the replicates by site.
-        gradients: site gradients of the data and of the first replicates, (1 + replicate, *site) by site.
-        projected: projected rows of those first replicates.
-    """
-
-    raw: jax.Array
-    observed: jax.Array
-    rows: jax.Array
-    values: Mapping[str, jax.Array]
-    gradients: Mapping[str, jax.Array]
-    projected: jax.Array
-
-
-def replicate(
-    problem: Problem, fitted: fitting.Fit, projection: Projection, key: jax.Array, settings: Settings
-) -> Replicates:
-    """Draw the bootstrap that the screening and the maps share."""
-    rows, values = problem.compiled.replicate(fitted.x, jax.random.split(key, settings.replicates))
-    rows = projection.with_prior(rows, jax.random.fold_in(key, 1))
-    raw = projection.before_fit(problem.compiled.residual(fitted.x))
-    observed = projection.rows(raw[None])[0]
-    projected = projection.rows(rows[: settings.site_replicates])
-    gradients = problem.compiled.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
-    return Replicates(raw, observed, rows, values, gradients, projected)
 
 
 def screen(
@@ -186,18 +153,27 @@ def _mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fo
     information = np.array(jnp.einsum("cmi,cmj->ij", found.columns, adjusted))
     total = np.array(jnp.einsum("cmi,cmi->i", found.columns, found.columns))
     u = np.array(jnp.einsum("cmk,cm->k", adjusted, drawn.raw))
-    u_null = np.array(jnp.einsum("cmk,rcm->rk", adjusted, drawn.rows))
     values = problem.observed_values
     for effect, group in zip(found.effects, found.groups, strict=True):
         for extra in found.extra[effect.name]:
             own = extra.shift.T @ extra.shift
             information[np.ix_(group, group)] += own
             total[group] += np.diag(own)
-            scores = extra.score(jnp.concatenate([values[extra.site][None], drawn.values[extra.site]]))
-            u[group] += scores[0]
-            u_null[:, group] += scores[1:]
+            u[group] += extra.score(values[extra.site][None])[0]
+    u_null = np.concatenate([_replicate_scores(adjusted, found, *portion) for portion in drawn.portions()])
     information = (information + information.T) / 2
     return _Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
+
+
+def _replicate_scores(
+    adjusted: jax.Array, found: Tangents, rows: jax.Array, values: Mapping[str, jax.Array]
+) -> np.ndarray:
+    """Scores (replicate, column) of mean effects."""
+    u = np.array(jnp.einsum("cmk,rcm->rk", adjusted, rows))
+    for effect, group in zip(found.effects, found.groups, strict=True):
+        for extra in found.extra[effect.name]:
+            u[:, group] += extra.score(values[extra.site])
+    return u
 
 
 def _mean_tests(scores: _Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

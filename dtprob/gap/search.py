@@ -14,11 +14,12 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
+from dtprob.gap.bootstrap import replicate
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection, project
 from dtprob.gap.refit import polished, refit, starting_points, without
 from dtprob.gap.scan import Found, scan
-from dtprob.gap.screen import Screening, replicate, screen
+from dtprob.gap.screen import Screening, screen
 from dtprob.gap.settings import Settings
 from dtprob.gap.where import Location, locate
 

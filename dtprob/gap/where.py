@@ -10,16 +10,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dtprob.gap.bootstrap import Replicates
 from dtprob.gap.curves import curves
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
-from dtprob.gap.screen import Replicates
 from dtprob.gap.tails import family_wise, gamma_tail
 
 _CHANCE = 8
@@ -75,26 +76,38 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
     """Test every site family and every block of coordinates at a fit."""
     at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
     values = {n: np.asarray(v) for n, v in at.items() if n in drawn.gradients}
-    scores = _scores(problem, drawn.gradients, values)
-    names = list(scores)
-    tests = [_family_test(scores[name][0], scores[name][1:]) for name in names]
-    p = np.array([one for one, _ in tests])
-    adjusted = (
-        family_wise(p, np.stack([null for _, null in tests], axis=1).min(axis=1)) if names else np.ones(0)
-    )
-    by_name = dict(zip(names, adjusted, strict=True))
+    tested = {name: _family_test(score) for name, score in _scores(problem, drawn.gradients, values)}
+    p = np.array([family.p_value for family in tested.values()])
+    null = [family.null for family in tested.values()]
+    adjusted = family_wise(p, np.stack(null, axis=1).min(axis=1)) if null else np.ones(0)
+    by_name = dict(zip(tested, adjusted, strict=True))
     findings = _best_per_site(
-        problem, fitted, projection, drawn, adjusted=by_name, scores=scores, values=values
+        problem, fitted, projection, drawn, adjusted=by_name, tested=tested, values=values
     )
     blocks, maps = _coordinates(problem, np.asarray(drawn.observed), np.asarray(drawn.projected))
     return Location(findings, blocks, maps, float(adjusted.min(initial=1.0)))
 
 
+class _Family(NamedTuple):
+    """A site family's test.
+
+    Attributes:
+        p_value: of the data.
+        null: p-value of each replicate.
+        first: scores (1 + _CHANCE, entry) of the data and of the first replicates.
+        variance: of the scores, (entry,).
+    """
+
+    p_value: float
+    null: np.ndarray
+    first: np.ndarray
+    variance: np.ndarray
+
+
 def _scores(
     problem: Problem, gradients: Mapping[str, jax.Array], values: Mapping[str, np.ndarray]
-) -> dict[tuple[str, str], np.ndarray]:
-    """Scores (1 + replicate, entry) of every site family, by (site, family)."""
-    scores: dict[tuple[str, str], np.ndarray] = {}
+) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
+    """(site, family) and scores (1 + replicate, entry) of every site family, one after another."""
     for site, gradient in gradients.items():
         g, axes = np.asarray(gradient), problem.declaration.sites[site].axes
         for kind, entry in (("additive", g), ("relative", g * values[site])):
@@ -105,12 +118,11 @@ def _scores(
             for kept in _kept_axes(shape):
                 summed = parts.sum(axis=tuple(1 + i for i in range(len(shape)) if i not in kept))
                 label = f"{kind}, " + (" x ".join(axes[i] for i in kept) if kept else "common")
-                scores[site, label] = summed.reshape(len(g), -1)
+                yield (site, label), summed.reshape(len(g), -1)
             for i, axis in enumerate(axes):
                 for name, curve in curves(problem, axis, shape[i]).items():
                     along = parts.sum(axis=tuple(1 + j for j in range(len(shape)) if j != i))
-                    scores[site, f"{kind}, {name}"] = (curve @ along).reshape(len(g), -1)
-    return scores
+                    yield (site, f"{kind}, {name}"), (curve @ along).reshape(len(g), -1)
 
 
 def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
@@ -121,22 +133,24 @@ def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
         yield from itertools.combinations(wide, size)
 
 
-def _family_test(observed: np.ndarray, null: np.ndarray) -> tuple[float, np.ndarray]:
-    """p-value of a family's summed squared scores, each entry scaled by its null variance, and of each replicate."""
-    n = len(null)
+def _family_test(scores: np.ndarray) -> _Family:
+    """Test a family's summed squared scores (1 + replicate, entry), each entry scaled by its null variance."""
+    first, n = scores[: 1 + _CHANCE].copy(), len(scores) - 1
+    observed, null = scores[0], scores[1:]
     total = (null**2).sum(0)
+    variance = total / n
     alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
     if not alive.any():
-        return 1.0, np.ones(n)
+        return _Family(1.0, np.ones(n), first, variance)
     null, observed, total = null[:, alive], observed[alive], total[alive]
     left_out = (total - null**2) / (n - 1)
     known = left_out > 1e-9 * total / n  # rare outcomes move an entry in one replicate and in no other
     statistic = (np.where(known, null**2, 0.0) / np.where(known, left_out, 1.0)).sum(1)
     value = float((observed**2 / (total / n)).sum())
-    mean, variance = statistic.mean(), statistic.var()
-    p_null, _ = gamma_tail(statistic, np.asarray(mean), np.asarray(variance))
-    p, _ = gamma_tail(np.asarray([value]), np.asarray(mean), np.asarray(variance))
-    return float(p[0]), p_null
+    mean, spread = statistic.mean(), statistic.var()
+    p_null, _ = gamma_tail(statistic, np.asarray(mean), np.asarray(spread))
+    p, _ = gamma_tail(np.asarray([value]), np.asarray(mean), np.asarray(spread))
+    return _Family(float(p[0]), p_null, first, variance)
 
 
 def _best_per_site(
@@ -146,7 +160,7 @@ def _best_per_site(
     drawn: Replicates,
     *,
     adjusted: Mapping[tuple[str, str], float],
-    scores: Mapping[tuple[str, str], np.ndarray],
+    tested: Mapping[tuple[str, str], _Family],
     values: Mapping[str, np.ndarray],
 ) -> tuple[SiteFinding, ...]:
     """For each site the family with the smallest p-value, with the gain along its steepest direction."""
@@ -154,12 +168,12 @@ def _best_per_site(
     for site, value in values.items():
         best = min(
             (n for n in adjusted if n[0] == site),
-            key=lambda n: (adjusted[n], -float((scores[n][0] ** 2).sum())),
+            key=lambda n: (adjusted[n], -float((tested[n].first[0] ** 2).sum())),
         )
-        variance = np.mean(scores[best][1:] ** 2, axis=0)
         shape = drawn.gradients[site].shape[1:]
         grown = np.broadcast_to(value, shape)
-        steps = [_direction(problem, best, score, variance, grown) for score in scores[best][: 1 + _CHANCE]]
+        family = tested[best]
+        steps = [_direction(problem, best, score, family.variance, grown) for score in family.first]
         shifts = projection.rows(
             jnp.moveaxis(problem.compiled.site_shift(fitted.x, {site: np.stack(steps)}), -1, 0)
         )

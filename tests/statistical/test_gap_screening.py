@@ -7,10 +7,11 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from dtprob.gap import fit as fitting
+from dtprob.gap.bootstrap import replicate
 from dtprob.gap.plausible import SCALES
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import project
-from dtprob.gap.screen import replicate, screen
+from dtprob.gap.screen import screen
 from dtprob.gap.search import view
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise, gamma_tail

@@ -1,0 +1,82 @@
+"""Data sets drawn at a fit, with which a diagnosis compares the data: drawn a portion at a time, as often as wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.gap.fit import Fit
+from dtprob.gap.problem import Problem
+from dtprob.gap.projection import Projection
+from dtprob.gap.settings import Settings
+
+_PORTION: Final = 50
+"""Replicates that are held at once."""
+
+
+@dataclass(frozen=True)
+class Replicates:
+    """The data and data sets drawn at a fit, the nuisances refitted to first order, and what they say at the sites.
+
+    Attributes:
+        problem, fitted, projection: where they are drawn.
+        keys: one per replicate.
+        raw: rows of the data (cluster, row), as if nothing had been fitted.
+        observed: projected rows of the data (cluster, row).
+        projected: projected rows of the first replicates (replicate, cluster, row).
+        gradients: site gradients of the data and of the first replicates, (1 + replicate, *site) by site.
+    """
+
+    problem: Problem
+    fitted: Fit
+    projection: Projection
+    keys: jax.Array
+    raw: jax.Array
+    observed: jax.Array
+    projected: jax.Array
+    gradients: Mapping[str, jax.Array]
+
+    def portions(self) -> Iterator[tuple[jax.Array, Mapping[str, jax.Array]]]:
+        """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
+        return _portions(self.problem, self.fitted, self.projection, self.keys)
+
+
+def replicate(
+    problem: Problem, fitted: Fit, projection: Projection, key: jax.Array, settings: Settings
+) -> Replicates:
+    """The bootstrap that the screening and the maps share.
+
+    Args:
+        problem: the model on its data.
+        fitted: where to draw.
+        projection: at the fit.
+        key: of the draws.
+        settings: how many replicates there are, and how many of them are taken to the sites.
+    """
+    keys = jax.random.split(key, settings.replicates)
+    raw = projection.before_fit(problem.compiled.residual(fitted.x))
+    observed = projection.rows(raw[None])[0]
+    parts = [
+        projection.rows(rows)
+        for rows, _ in _portions(problem, fitted, projection, keys[: settings.site_replicates])
+    ]
+    projected = jnp.concatenate(parts)
+    gradients = problem.compiled.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
+    return Replicates(problem, fitted, projection, keys, raw, observed, projected, gradients)
+
+
+def _portions(
+    problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array
+) -> Iterator[tuple[jax.Array, Mapping[str, jax.Array]]]:
+    """Portions of one size are drawn, so that one program serves all; of the last one as much as there are keys."""
+    place = np.arange(-(-len(keys) // _PORTION) * _PORTION).reshape(-1, _PORTION)
+    for part in place:
+        own = keys[np.minimum(part, len(keys) - 1)]
+        rows, values = problem.compiled.replicate(fitted.x, own)
+        count = int((part < len(keys)).sum())
+        yield projection.with_prior(rows, own)[:count], {n: v[:count] for n, v in values.items()}
