@@ -21,6 +21,7 @@ from dtprob.gap.evidence import Evidence
 from dtprob.gap.problem import Problem
 from dtprob.gap.search import Say, alarmed, search
 from dtprob.gap.settings import Settings
+from dtprob.gap.shares import shares
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.declaration import Data, Model
@@ -98,7 +99,9 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     fraction = (
         closed.closed_fraction(held_before, held_after, bracket, keys[3]) if last.fitted.effects else None
     )
-    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction)
+    held = held_before, held_after
+    parts = shares(last.problem, last.fitted, held, assignment, keys[3]) if fraction is not None else ()
+    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts)
 
 
 def _causes(
@@ -113,9 +116,18 @@ def _causes(
     first = evidence.held_after.estimates
     strata = tuple(float(v) for v in next(iter(first.values()))[:, 0]) if first else ()
     physics = "; ".join(e.physics for e in effects if e.physics)
-    return (
-        Cause(evidence.accepted, classes, probability, sizes, evidence.fraction, physics, strata, plausible),
+    cause = Cause(
+        effects=evidence.accepted,
+        alias_class=classes,
+        probability=probability,
+        size=sizes,
+        closed_fraction=evidence.fraction,
+        shares=evidence.shares,
+        physics=physics,
+        strata=strata,
+        plausible=plausible,
     )
+    return (cause,)
 
 
 def alternatives(evidence: Evidence, settings: Settings) -> tuple[tuple[tuple[str, ...], ...], float]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from dtprob.gap.closed import ClosedFraction
+from dtprob.gap.shares import Share
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,7 @@ class Cause:
         probability: among the sets that were refitted.
         size: posterior of each scalar parameter.
         closed_fraction: on held-out clusters; None where not established.
+        shares: how much of that each effect closes, where there are several.
         physics: one line.
         strata: the first parameter's estimate in each fold.
         plausible: whether the size lies within what the effect's prior calls plausible.
@@ -43,6 +45,7 @@ class Cause:
     probability: float
     size: tuple[Size, ...]
     closed_fraction: ClosedFraction | None
+    shares: tuple[Share, ...]
     physics: str
     strata: tuple[float, ...]
     plausible: bool
@@ -86,6 +89,7 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "closed_fraction": None
         if closed is None
         else {"mean": closed.mean, "low": closed.low, "high": closed.high},
+        "shares": [asdict(share) for share in cause.shares],
         "physics": cause.physics,
         "strata": {"estimate": list(cause.strata)},
         "plausible": cause.plausible,

@@ -8,6 +8,7 @@ from dtprob.gap.closed import ClosedFraction, HeldOut
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.search import Step, View
+from dtprob.gap.shares import Share
 from dtprob.gap.where import Location
 
 
@@ -22,6 +23,7 @@ class Evidence:
     held_after: HeldOut
     bracket: tuple[float, float]
     fraction: ClosedFraction | None
+    shares: tuple[Share, ...]
 
     @property
     def before(self) -> Location:

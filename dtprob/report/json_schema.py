@@ -53,6 +53,16 @@ class Strata(TypedDict):
     estimate: list[Number]
 
 
+class Share(TypedDict):
+    """Shapley's part of one effect in what its set closes, with its interval; `own` is what no other could close."""
+
+    effect: str
+    mean: Number
+    low: Number
+    high: Number
+    own: Number
+
+
 class Cause(TypedDict):
     """A set of effects that may explain the gap; the data cannot tell the sets of `alias_class` apart."""
 
@@ -61,6 +71,7 @@ class Cause(TypedDict):
     probability: Probability
     size: dict[str, Size]
     closed_fraction: Interval | None
+    shares: NotRequired[list[Share]]
     physics: NotRequired[str]
     strata: NotRequired[Strata]
     plausible: NotRequired[bool]

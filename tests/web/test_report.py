@@ -74,6 +74,19 @@ def test_says_the_verdict_and_what_to_do(verdict: str, report: dict[str, Any], p
     assert report["provenance"]["data_sha256"] in text
 
 
+def test_several_effects_have_their_shares(examples: dict[str, Any]) -> None:
+    report = examples["LISTED_WITH_REMAINDER"]()
+    names = report["causes"][0]["effects"]
+    assert "Only it" not in Page(render(report, None, title="x")).text
+    report["causes"][0]["shares"] = [
+        {"effect": name, "mean": mean, "low": mean - 0.1, "high": mean + 0.1, "own": mean - 0.05}
+        for name, mean in zip(names, (0.7, 0.3), strict=True)
+    ]
+    text = Page(render(report, None, title="x")).text
+    assert "Of what they close together, each closes" in text
+    assert re.search(r"Timing offset 70% ?60 to 80% 65%", text)
+
+
 def test_summary_of_the_diagnosis_is_the_headline(examples: dict[str, Any]) -> None:
     report = {**examples["UNDETERMINED"](), "summary": "All is <well>."}
     page = render(report, None, title="x")
