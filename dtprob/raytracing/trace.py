@@ -12,6 +12,7 @@ from jaxtyping import Float, Int
 
 from dtprob.errors import InputError, unknown_name
 from dtprob.raytracing.assemble import Antenna, Flat, assemble
+from dtprob.raytracing.inside import enclosing_objects
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.sionna import sionna_rt
 from dtprob.raytracing.solve import Settings, Traced, describe_objects, solve
@@ -146,7 +147,8 @@ def trace(
         allow_empty: whether a link may have no path.
 
     Raises:
-        InputError: a link without a path, wrong positions, an unknown pattern, or an unsupported interaction.
+        InputError: a link without a path, an end inside a wall, wrong positions, an unknown pattern, or an
+            unsupported interaction.
     """
     tx, rx = _positions("tx_position", tx_position), _positions("rx_position", rx_position)
     _check_request(tx, rx, max_depth, samples, diffraction=diffraction, diffuse_reflection=diffuse_reflection)
@@ -157,7 +159,8 @@ def trace(
     receiving = Antenna(rx_pattern, other, rx_orientation).checked()
     objects = describe_objects(scene)
     flat = _trace_links(scene, tx, rx, settings)
-    _check_found(flat, len(tx), allow_empty=allow_empty)
+    if not allow_empty:
+        _check_found(scene, flat, tx, rx)
     return assemble(
         flat, objects, tx=tx, rx=rx, antennas=(sending, receiving), frequency=carrier, settings=settings
     )
@@ -258,11 +261,19 @@ def _check_request(
         raise InputError("interactions to trace", expected, " and ".join(asked), remedy)
 
 
-def _check_found(flat: Flat, n_link: int, *, allow_empty: bool) -> None:
-    empty = sorted(set(range(n_link)) - set(flat.link.tolist()))
-    if empty and not allow_empty:
-        shown = ", ".join(map(str, empty[:20])) + (", ..." if len(empty) > 20 else "")
-        remedy = "Check their positions, raise max_depth or samples, or allow links without a path"
-        raise InputError(
-            "paths of the links", "a path or more for each link", f"none for links {shown}", remedy
-        )
+def _check_found(
+    scene: Any, flat: Flat, tx: Float[np.ndarray, "link 3"], rx: Float[np.ndarray, "link 3"]
+) -> None:
+    empty = sorted(set(range(len(tx))) - set(flat.link.tolist()))
+    if not empty:
+        return
+    for name, place in (("rx_position", rx[empty[0]]), ("tx_position", tx[empty[0]])):
+        around = enclosing_objects(scene, place)
+        if around:
+            got = f"{np.round(place, 3).tolist()} inside '{around[0]}'"
+            raise InputError(
+                f"{name} of link {empty[0]}", "a place in the open", got, "Move it out of the wall"
+            )
+    shown = ", ".join(map(str, empty[:20])) + (", ..." if len(empty) > 20 else "")
+    remedy = "Check their positions, raise max_depth or samples, or allow links without a path"
+    raise InputError("paths of the links", "a path or more for each link", f"none for links {shown}", remedy)

@@ -5,7 +5,12 @@ measurement that are computed once: no iteration sees an antenna or a subcarrier
 `dtprob.inference` finds posteriors.
 """
 
-from dtprob.raytracing.calibration.calibrate import Calibration, calibrate, calibrate_runs
+from dtprob.raytracing.calibration.calibrate import (
+    Calibration,
+    calibrate,
+    calibrate_runs,
+    object_groups,
+)
 from dtprob.raytracing.calibration.settings import SCHEMES, Scheme, Settings
 from dtprob.raytracing.calibration.statistics import Statistics, project
 
@@ -17,5 +22,6 @@ __all__ = [
     "Statistics",
     "calibrate",
     "calibrate_runs",
+    "object_groups",
     "project",
 ]

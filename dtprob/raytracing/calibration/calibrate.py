@@ -1,6 +1,6 @@
 """The loop of a calibration: an E-step for the phases, a gradient step for the materials."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,7 +11,7 @@ import optax
 from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, unknown_name
 from dtprob.raytracing.calibration import phases
 from dtprob.raytracing.calibration.phases import Field, Phasors
 from dtprob.raytracing.calibration.settings import Settings
@@ -46,10 +46,11 @@ class _Task(eqx.Module):
     count: int = eqx.field(static=True)
     settings: Settings = eqx.field(static=True)
 
-    def gain(self, coordinates: Float[Array, "2 group"]) -> Complex[Array, "link path"]:
-        """Gains of the paths."""
+    def gain(self, coordinates: Float[Array, "2 group"]) -> tuple[Array, Array]:
+        """Gains of the paths, real and imaginary part."""
         permittivity, conductivity = self.materials(coordinates)
-        return path_gain(self.paths, permittivity, conductivity, law=self.settings.law)
+        gain = path_gain(self.paths, permittivity, conductivity, law=self.settings.law)
+        return jnp.real(gain), jnp.imag(gain)
 
     def materials(self, coordinates: Float[Array, "2 group"]) -> tuple[Array, Array]:
         """Permittivity and conductivity of each object."""
@@ -121,6 +122,30 @@ def calibrate_runs(
     return _runs(task, statistics, power)
 
 
+def object_groups(paths: PathSet, together: Sequence[Sequence[str]]) -> Int[np.ndarray, " object"]:
+    """The argument `groups` of a calibration from names: each list shares one material, other objects keep their class's.
+
+    Args:
+        paths: of the twin.
+        together: names of the objects of each group.
+
+    Raises:
+        InputError: the scene has no object of a name, or one is in two groups.
+    """
+    label: list[str | int] = [paths.material_names[i] for i in np.asarray(paths.object_material)]
+    seen: set[str] = set()
+    for number, names in enumerate(together):
+        for name in names:
+            if name not in paths.object_names:
+                raise unknown_name("object of a group", name, paths.object_names, "object")
+            if name in seen:
+                raise InputError("groups", "an object in one group at most", f"'{name}' in two", "Choose one")
+            seen.add(name)
+            label[paths.object_names.index(name)] = number
+    order = {one: number for number, one in enumerate(dict.fromkeys(label))}
+    return np.asarray([order[one] for one in label])
+
+
 def _check(
     paths: PathSet, statistics: Statistics, noise_power: Array, settings: Settings, groups: np.ndarray
 ) -> None:
@@ -153,9 +178,11 @@ def _calibrate(task: _Task, statistics: Statistics, noise_power: Float[Array, " 
     optimiser = optax.chain(optax.clip_by_global_norm(settings.clip), optax.adam(settings.rate))
 
     def step(state: _State, number: Array) -> tuple[_State, Array]:
-        state = _expect(task, state, statistics, number)
+        (real, imaginary), pull = jax.vjp(task.gain, state.coordinates)
+        state = _expect(settings, state, lax.complex(real, imaginary), statistics, number)
         objective = _objective(settings, state.phasors, _turned(statistics, state.turn))
-        loss, slope = jax.value_and_grad(lambda c: objective(task.gain(c)))(state.coordinates)
+        loss, slopes = jax.value_and_grad(lambda parts: objective(lax.complex(*parts)))((real, imaginary))
+        (slope,) = pull(slopes)
         moves, moments = optimiser.update(slope, state.moments)
         coordinates = jnp.asarray(optax.apply_updates(state.coordinates, moves))
         return state._replace(coordinates=coordinates, moments=moments), loss
@@ -183,29 +210,36 @@ def _turned(statistics: Statistics, turn: Array) -> Statistics:
     return eqx.tree_at(lambda s: s.product, statistics, statistics.product * jnp.conj(turn))
 
 
-def _expect(task: _Task, state: _State, statistics: Statistics, number: Array) -> _State:
+def _expect(
+    settings: Settings,
+    state: _State,
+    gain: Complex[Array, "link path"],
+    statistics: Statistics,
+    number: Array,
+) -> _State:
     """The E-step, and what follows from it in closed form: concentration, noise power, common phases."""
-    settings = task.settings
     if settings.scheme not in ("aware", "aware_reference"):
         return state
-    gain, seen = task.gain(state.coordinates), _turned(statistics, state.turn)
+    seen = _turned(statistics, state.turn)
     over = state.noise_power[:, None, None]
     coupling = jnp.conj(gain)[:, :, None] * seen.gram * gain[:, None] / over
     field = Field(jnp.conj(gain)[:, None] * seen.product / over, coupling, state.concentration)
-    phasors = _phasors(field, state.phasors, settings, number)
-    moved = state._replace(phasors=phasors)
-    if not settings.fixed_concentration:
-        exists = jnp.broadcast_to((field.snr > 0)[:, None], phasors.mean.shape)
-        mean = jnp.sum(jnp.where(exists, jnp.real(phasors.mean), 0.0)) / jnp.sum(exists)
-        moved = moved._replace(concentration=phases.concentration_of(mean))
-    if settings.estimate_noise:
-        rest = jnp.mean(_residual(gain, phasors, seen), axis=1)
-        moved = moved._replace(noise_power=rest / statistics.size)
+    phasors, turn = _phasors(field, state.phasors, settings, number), state.turn
+    exists = jnp.broadcast_to((field.snr > 0)[:, None], phasors.mean.shape)
     if settings.global_phase:
-        matched = jnp.sum(jnp.conj(phasors.mean * gain[:, None]) * statistics.product, axis=2, keepdims=True)
-        size = jnp.abs(matched)
-        moved = moved._replace(turn=jnp.where(size > 0, matched / jnp.where(size > 0, size, 1.0), 1.0))
-    return moved
+        # what the angles have in common is the phase of the snapshot: their prior is then most at ease
+        total = jnp.sum(jnp.where(exists, phasors.mean, 0), axis=2, keepdims=True)
+        size = jnp.abs(total)
+        common = jnp.where(size > 0, total / jnp.where(size > 0, size, 1.0), 1.0)
+        phasors, turn = phasors._replace(mean=phasors.mean * jnp.conj(common)), turn * common
+        seen = _turned(statistics, turn)
+    concentration, noise_power = state.concentration, state.noise_power
+    if not settings.fixed_concentration:
+        mean = jnp.sum(jnp.where(exists, jnp.real(phasors.mean), 0.0)) / jnp.sum(exists)
+        concentration = phases.concentration_of(mean)
+    if settings.estimate_noise:
+        noise_power = jnp.mean(_residual(gain, phasors, seen), axis=1) / statistics.size
+    return state._replace(phasors=phasors, turn=turn, concentration=concentration, noise_power=noise_power)
 
 
 def _phasors(field: Field, before: Phasors, settings: Settings, number: Array) -> Phasors:

@@ -6,6 +6,7 @@ distributions of direction mu_p and concentration k_p, of mean phasor m_p = R(k_
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jax.scipy.special import i0e, i1e
@@ -113,16 +114,14 @@ def swept(field: Field, start: Phasors, sweeps: int) -> Phasors:
 
 def best(field: Field, starts: tuple[Phasors, ...], sweeps: int) -> Phasors:
     """The exact E-step from several starts; every snapshot keeps that of the lowest free energy."""
-    chosen = swept(field, starts[0], sweeps)
-    energy = free_energy(field, chosen)
-    for start in starts[1:]:
-        other = swept(field, start, sweeps)
-        lower = free_energy(field, other) < energy
-        energy = jnp.where(lower, free_energy(field, other), energy)
-        chosen = Phasors(
-            *(jnp.where(lower[..., None], new, old) for new, old in zip(other, chosen, strict=True))
-        )
-    return chosen
+
+    def arrive(start: Phasors) -> tuple[Phasors, Float[Array, "link snapshot"]]:
+        found = swept(field, start, sweeps)
+        return found, free_energy(field, found)
+
+    found, energy = lax.map(arrive, jax.tree.map(lambda *leaves: jnp.stack(leaves), *starts))
+    lowest = jnp.argmin(energy, axis=0)[None, ..., None]
+    return jax.tree.map(lambda leaf: jnp.take_along_axis(leaf, lowest, axis=0)[0], found)
 
 
 def free_energy(field: Field, phasors: Phasors) -> Float[Array, "link snapshot"]:

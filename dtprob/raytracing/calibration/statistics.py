@@ -86,18 +86,30 @@ def project(
         InputError: the channel has another shape, or holds NaN or infinity.
     """
     responses = _responses(paths, subcarrier_frequency, rx_array, tx_array)
-    expected = (paths.n_link, responses.rx.shape[2], responses.tx.shape[2], responses.tone.shape[2])
-    if channel.ndim != 5 or (channel.shape[0], *channel.shape[2:]) != expected:
-        raise InputError(
-            "channel",
-            f"shape ({paths.n_link}, snapshot, {', '.join(map(str, expected[1:]))})",
-            str(channel.shape),
-            "Give the links, arrays and subcarriers of the measurement",
-        )
+    _check_shape(paths, responses, channel)
     if not isinstance(channel, Tracer) and not np.all(np.isfinite(np.asarray(channel))):
         remedy = "Leave out snapshots that were not measured"
         raise InputError("channel", "finite values", "NaN or infinity", remedy)
     return _project(responses, jnp.asarray(channel), powers)
+
+
+def _check_shape(paths: PathSet, responses: _Responses, channel: Array) -> None:
+    """Compare a channel's axes, one by one, with what says how long they are."""
+    if channel.ndim != 5:
+        expected = "axes (link, snapshot, rx_antenna, tx_antenna, subcarrier)"
+        raise InputError(
+            "channel", expected, f"shape {channel.shape}", "Give all five, of length 1 if need be"
+        )
+    declared = {
+        "link": (0, paths.n_link, "the path set"),
+        "rx_antenna": (2, responses.rx.shape[2], "rx_array"),
+        "tx_antenna": (3, responses.tx.shape[2], "tx_array"),
+        "subcarrier": (4, responses.tone.shape[2], "subcarrier_frequency"),
+    }
+    for name, (axis, size, source) in declared.items():
+        if channel.shape[axis] != size:
+            expected, got = f"the {size} of {source}", str(channel.shape[axis])
+            raise InputError(f"channel, axis {name}", expected, got, f"Let {source} describe the measurement")
 
 
 def _responses(
