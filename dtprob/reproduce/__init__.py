@@ -14,6 +14,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "fig6a": "dtprob.reproduce.fig6a",
     "fig6b": "dtprob.reproduce.fig6b",
     "fig7": "dtprob.reproduce.fig7",
+    "fig8": "dtprob.reproduce.fig8",
     "fig9": "dtprob.reproduce.fig9",
     "fig10": "dtprob.reproduce.fig10",
     "fig10_learned": "dtprob.reproduce.fig10_learned",
