@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, PRNGKeyArray
 
 from dtprob.inference import PointMass, Sampler
+from dtprob.inference.concentrations import LearnedConcentration
 from dtprob.inference.exact import DirichletTables
 from dtprob.models.dirichlet import log_shares
 from dtprob.models.multi_access import Clusters, kernel, priors
@@ -28,6 +29,7 @@ METRICS: Final = {"throughput": throughput}
 _TRUTH: Final = Network.reference()
 _CLUSTERS: Final = Clusters(_TRUTH.clusters)
 _PRIOR: Final = {"bayesian": 0.01, "bayesian_jeffreys": 0.5}
+_NAMES: Final = (*_PRIOR, "bayesian_learned", "map")
 _MODE: Final = 1.01
 _TWIN: Final = kernel(_TRUTH.clusters)
 _POLICY: Final = random_access(_CLUSTERS.devices, 0.4)
@@ -46,11 +48,12 @@ def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
     }
     notes = [
         f"Random access with probability 0.4; horizon {HORIZON} slots; {_DRAWS} draws, {_EPISODES} episodes of each.",
-        "bayesian: prior concentration .01; bayesian_jeffreys: .5; map: the mode under 1.01, its own randomness only.",
+        "bayesian: prior concentration .01; bayesian_jeffreys: .5; bayesian_learned: each table's is learned;",
+        "map: the mode under 1.01, its own randomness only.",
     ]
     panels: list[Panel] = []
     for metric in METRICS:
-        covered = [_coverage(name, metric, cells) for name in (*_PRIOR, "map")]
+        covered = [_coverage(name, metric, cells) for name in _NAMES]
         notes += [
             f"{metric}, {s.name}: "
             + ", ".join(f"T={t:.0f} {value:.3f}" for t, value in zip(s.x, s.median, strict=True))
@@ -62,7 +65,7 @@ def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
             Series.of_runs(
                 name, SLOTS, np.stack([cells[t][f"{name}.{metric}.width"] for t in SLOTS], axis=-1)
             )
-            for name in (*_PRIOR, "map")
+            for name in _NAMES
         ]
         panels.append(Panel(metric, x, Quantity("width of 90% intervals"), tuple(widths)))
     return Figure("prediction", "predictions of the twin", tuple(panels), runs, tuple(notes))
@@ -139,6 +142,9 @@ def _samplers(counts: Mapping[str, np.ndarray]) -> dict[str, Sampler]:
         name: _InTurn(DirichletTables(repeated(a)).updated(counts)) for name, a in _PRIOR.items()
     }
     allowed = {name: value > 0 for name, value in repeated(1.0).items()}
+    found["bayesian_learned"] = _InTurn(
+        LearnedConcentration({name: value > 0 for name, value in priors(_CLUSTERS, 1.0).items()}, counts)
+    )
     mode = {name: log_shares(value + _MODE - 1, allowed[name]) for name, value in counts.items()}
     return {**found, "map": _InTurn(PointMass(mode))}
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dtprob.control import FramePolicy, HistoryPolicy, TablePolicy, aloha, evaluate, tabulate, tdma
+from dtprob.control.device import Seen, step
 from dtprob.control.environment import Observation
 from dtprob.control.export import load, save
 from dtprob.control.policy import unroll
@@ -94,6 +95,37 @@ def test_what_is_no_table_is_refused(tmp_path, content):
         load(tmp_path / "policy.json")
     with pytest.raises(InputError, match="FileNotFoundError"):
         load(tmp_path / "missing.json")
+
+
+def test_a_recurrent_policy_runs_on_a_device_as_it_was_trained(tmp_path):
+    """Loaded again it is the same; a device's own step in NumPy gives the same chances over a history."""
+    policy, seen = HistoryPolicy(KEY, 4), observations(16)
+    save(policy, tmp_path / "policy.npz")
+    again = load(tmp_path / "policy.npz")
+    assert all(map(np.array_equal, jax.tree.leaves(policy), jax.tree.leaves(again)))
+    start = jnp.zeros(16, bool)
+    logit = np.asarray(unroll(policy, policy.initial(), seen, start)[1], float)
+    with np.load(tmp_path / "policy.npz", allow_pickle=False) as stored:
+        weights = {name: stored[name] for name in stored.files if name != "format"}
+    for own in range(4):
+        memory = np.zeros(16)
+        for slot in range(16):
+            now = Seen(*(int(part[slot, own]) for part in seen[:4]), int(seen.slot[slot]))
+            memory, chance = step(weights, own, memory, now)
+            assert chance == pytest.approx(1 / (1 + np.exp(-logit[slot, own])), rel=1e-5)
+
+
+def test_what_is_no_recurrent_policy_is_refused(tmp_path):
+    (tmp_path / "policy.npz").write_text("nothing")
+    with pytest.raises(InputError, match="a policy"):
+        load(tmp_path / "policy.npz")
+    with pytest.raises(InputError, match=r"the suffix \.npz"):
+        save(HistoryPolicy(KEY, 4), tmp_path / "policy.json")
+    save(HistoryPolicy(KEY, 4), tmp_path / "policy.npz")
+    with np.load(tmp_path / "policy.npz", allow_pickle=False) as stored:
+        np.savez(tmp_path / "policy.npz", **{**stored, "cell_bias": np.zeros(3)})
+    with pytest.raises(InputError, match="cell_bias"):
+        load(tmp_path / "policy.npz")
 
 
 def test_policies_meet_the_same_arrivals():
