@@ -29,7 +29,7 @@ class Counted:
     """Progress that gives made-up parts: every second interval holds the value."""
 
     def part(self, _name, _compute):
-        methods = (*prediction._PRIOR, "map")
+        methods = prediction._NAMES
         found = {f"{method}.throughput.inside": np.tile([0.0, 1.0], 5) for method in methods}
         return found | {f"{method}.throughput.width": np.linspace(0.1, 0.3, 10) for method in methods}
 
@@ -37,7 +37,7 @@ class Counted:
 def test_the_figure():
     figure = prediction.run(jax.random.key(0), 10, Counted())
     coverage, width = figure.panels
-    names = {"bayesian", "bayesian_jeffreys", "map"}
+    names = {"bayesian", "bayesian_jeffreys", "bayesian_learned", "map"}
     for panel in figure.panels:
         assert {series.name for series in panel.series} == names
     assert all(np.all(series.median == 0.5) for series in coverage.series)
