@@ -1,0 +1,49 @@
+"""A user's own model on a user's own table: the example names the site, street by street."""
+
+import runpy
+import shutil
+from pathlib import Path
+
+import pytest
+
+from dtprob.case import load_case
+from dtprob.errors import InputError
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.settings import Settings
+from dtprob.workflow import prepare
+
+EXAMPLE = Path(__file__).parents[3] / "examples" / "path_loss"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    for file in EXAMPLE.glob("*.*"):
+        shutil.copy(file, tmp_path)
+    return tmp_path
+
+
+def test_the_table_is_what_its_script_writes(folder, monkeypatch):
+    before = (folder / "table.csv").read_bytes()
+    monkeypatch.syspath_prepend(str(folder))
+    runpy.run_path(str(folder / "make_table.py"), run_name="__main__")
+    assert (folder / "table.csv").read_bytes() == before
+
+
+def test_the_site_that_sends_less_is_named(folder):
+    prepared = prepare(load_case(folder / "case.toml"), need="diagnosis")
+    assert prepared.cluster == "segment"
+    found = diagnose(
+        prepared.model, prepared.data, prepared.effects, key=prepared.key, engine=prepared.engine,
+        cluster=prepared.cluster, settings=Settings(replicates=100, site_replicates=39, candidates=2, polished=1),
+    )  # fmt: skip
+    assert found.verdict == "LISTED"
+    assert found.causes[0].effects == ("site_gain[harbour]",)
+    size = found.causes[0].size[0]
+    assert size.low < -5.0 < size.high
+    assert found.to_report()["fit"]["n_clusters"] == 30
+    assert found.maps["clusters"].sizes["segment"] == 30
+
+
+def test_code_of_the_users_own_can_be_refused(folder):
+    with pytest.raises(InputError, match="a model and effects of dtprob"):
+        prepare(load_case(folder / "case.toml"), need="diagnosis", allow_code=False)
