@@ -35,6 +35,8 @@ class DataSection:
     Attributes:
         file: the data file.
         reference: earlier data from which the twin was learned; its posterior is the prior of a diagnosis.
+        designs: measurements that could be made, as data of the same kind; where causes cannot be told apart, a diagnosis
+            ranks them. What is observed in them is not looked at.
         phase: what the phases of the data mean; "coherent" unless said.
         cluster: the column or axis whose values belong together; the model's own unless said.
         options: settings of the reader, for data that have some.
@@ -42,6 +44,7 @@ class DataSection:
 
     file: Path
     reference: Path | None = None
+    designs: Path | None = None
     phase: Phase | None = None
     cluster: str | None = None
     options: Options = field(default_factory=dict)
@@ -293,10 +296,8 @@ def _shown(value: Any) -> str:
 
 def _resolved(case: Case) -> Case:
     """The case with its paths made complete."""
-    reference = case.data.reference
-    data = replace(
-        case.data, file=case.folder / case.data.file, reference=reference and case.folder / reference
-    )
+    reference, designs = (path and case.folder / path for path in (case.data.reference, case.data.designs))
+    data = replace(case.data, file=case.folder / case.data.file, reference=reference, designs=designs)
     scene = case.scene
     if scene is not None:
         is_path = Path(scene.file).suffix.lower() in {".xml", ".nc", ".json"}

@@ -66,6 +66,7 @@ def _diagnose(case: Case, job: Run) -> tuple[dict[str, Any], DataTree]:
         engine=prepared.engine,
         cluster=prepared.cluster,
         reference=reference,
+        designs=prepared.designs,
         say=job.say,
     )
     report = diagnosis.to_report()

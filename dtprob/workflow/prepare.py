@@ -36,6 +36,7 @@ class Prepared:
         model: the generative model.
         data: its arguments by name.
         reference: the arguments that the twin was learned from, if the case names them.
+        designs: arguments for measurements that could be made, by name.
         effects: the candidate effects that the model and the data allow.
         engine: the inference engine.
         key: the typed JAX key of the case's seed.
@@ -47,6 +48,7 @@ class Prepared:
     model: Model
     data: Mapping[str, Any]
     reference: Mapping[str, Any] | None
+    designs: Mapping[str, Mapping[str, Any]]
     effects: tuple[Effect, ...]
     engine: AbstractEngine
     key: jax.Array
@@ -94,14 +96,18 @@ def prepare(
     model = _model(case)
     say(f"reading {case.data.file.name}")
     arguments = _arguments(case, model, case.data.file, cache, say)
-    reference, effects = None, ()
+    reference, designs, effects = None, {}, ()
     if need == "diagnosis":
         if case.data.reference is not None:
             say(f"reading {case.data.reference.name}")
             reference = _arguments(case, model, case.data.reference, cache, say)
+        if case.data.designs is not None:
+            say(f"reading {case.data.designs.name}")
+            designs = {case.data.designs.stem: _arguments(case, model, case.data.designs, cache, say)}
         effects = _effects(case, model, arguments)
     key, digest = jax.random.key(case.seed.value), sha256(case.data.file)
-    return Prepared(case, model, arguments, reference, effects, engine, key, case.data.cluster, digest)
+    cluster = case.data.cluster
+    return Prepared(case, model, arguments, reference, designs, effects, engine, key, cluster, digest)
 
 
 def make_engine(section: EngineSection, where: str) -> AbstractEngine:

@@ -47,3 +47,13 @@ def test_the_site_that_sends_less_is_named(folder):
 def test_code_of_the_users_own_can_be_refused(folder):
     with pytest.raises(InputError, match="a model and effects of dtprob"):
         prepare(load_case(folder / "case.toml"), need="diagnosis", allow_code=False)
+
+
+def test_measurements_that_could_be_made_are_read_like_the_data(folder):
+    shutil.copy(folder / "table.csv", folder / "elsewhere.csv")
+    case = (folder / "case.toml").read_text().replace("[effects]", 'designs = "elsewhere.csv"\n\n[effects]')
+    (folder / "case.toml").write_text(case)
+    prepared = prepare(load_case(folder / "case.toml"), need="diagnosis")
+    assert list(prepared.designs) == ["elsewhere"]
+    assert set(prepared.designs["elsewhere"]) == set(prepared.data)
+    assert prepare(load_case(folder / "case.toml"), need="fit").designs == {}
