@@ -5,7 +5,8 @@ from pathlib import Path
 
 from dtprob.case import Case
 from dtprob.commands.run import Run, chosen, infer, prepare_case, session, write_text
-from dtprob.workflow.summary import summarise
+from dtprob.workflow.identified import contraction
+from dtprob.workflow.summary import summarise, summarised
 
 
 def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code: bool, resume: bool) -> None:
@@ -25,7 +26,8 @@ def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code:
         posterior = infer(prepared, prepared.data, out / "posterior.nc", job)
         if "reason" in posterior.provenance:
             say(f"{posterior.provenance['chosen']} was chosen: {posterior.provenance['reason']}")
-        summary = summarise(posterior)
+        known = contraction(posterior, prepared.model, prepared.data, summarised(posterior))
+        summary = summarise(posterior, known)
         summary["provenance"] |= prepared.provenance
         write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
         for warning in summary["warnings"]:

@@ -17,8 +17,8 @@ from dtprob.raytracing import field
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.slab import Law
 
-type Materials = Literal["per_material", "per_object", "shared", "known"]
-"""Which permittivities and conductivities are unknown."""
+type Materials = Literal["per_material", "per_object", "hierarchical", "shared", "known"]
+"""Which permittivities and conductivities are unknown; "hierarchical" gives objects their own, about their class's."""
 
 CHANNEL_AXES = ("link", "snapshot", "rx_antenna", "tx_antenna", "subcarrier")
 AXES = {
@@ -93,7 +93,18 @@ def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, 
         material_conductivity: Any = numpyro.sample(
             "material_conductivity", dist.LogNormal(jnp.log(jnp.maximum(nominal_conductivity, 1e-4)), 1.0)
         )
+    if materials == "hierarchical":
+        contrast = _about("permittivity", material_permittivity[index] - 1.0)
+        return 1.0 + contrast, _about("conductivity", material_conductivity[index])
     return material_permittivity[index], material_conductivity[index]
+
+
+def _about(name: str, centre: jax.Array) -> jax.Array:
+    """Values of objects about those of their classes, by factors of an unknown spread, expected about a tenth."""
+    spread: Any = numpyro.sample(f"{name}_spread", dist.LogNormal(jnp.log(0.1), 1.0))
+    with numpyro.plate("object", centre.shape[0]):
+        deviation: Any = numpyro.sample(f"{name}_deviation", dist.Normal(0.0, 1.0))
+    return centre * jnp.exp(spread * deviation)
 
 
 def traced_gain(paths: PathSet, materials: Materials, law: Law) -> Complex[Array, "link path"]:

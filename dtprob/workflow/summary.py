@@ -2,12 +2,13 @@
 
 import json
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Any
 
 import numpy as np
 
 from dtprob.inference import Posterior, summary
+from dtprob.workflow.identified import UNIDENTIFIED
 
 LARGEST = 1000
 """Sites with more entries than this are only named: their draws are in posterior.nc."""
@@ -16,11 +17,13 @@ LARGEST_R_HAT = 1.01
 LARGEST_PARETO_K = 0.7
 
 
-def summarise(posterior: Posterior) -> dict[str, Any]:
+def summarise(posterior: Posterior, contractions: Mapping[str, np.ndarray] | None = None) -> dict[str, Any]:
     """The content of summary.json.
 
     Args:
         posterior: from any engine.
+        contractions: for latent sites, what `dtprob.workflow.identified.contraction` finds of their entries; each is
+            then told with its parameter, and a warning names those of which the data say nothing.
 
     Returns:
         plain numbers and text: `parameters` (for each entry of each latent site the columns of
@@ -28,19 +31,37 @@ def summarise(posterior: Posterior) -> dict[str, Any]:
         `warnings` (sentences; empty when all is well), `chains`, `draws`, `diverging`, `provenance`. What
         does not exist, such as the r-hat of a single chain, is left out.
     """
-    sizes = {name: int(np.prod(posterior.draws[name].shape[2:])) for name in posterior.latent}
-    small = [name for name, size in sizes.items() if size <= LARGEST]
+    small = summarised(posterior)
     table = summary(posterior, small).to_dict("index") if small else {}
-    rows = {str(label): _present(row) for label, row in table.items()}
+    known = _by_label(contractions or {})
+    rows = {
+        str(label): _present(row | ({"contraction": known[label]} if label in known else {}))
+        for label, row in table.items()
+    }
     diverging = int(np.sum(posterior.sample_stats.get("diverging", 0)))
     return {
         "parameters": rows,
-        "not_summarised": [name for name in sizes if name not in small],
+        "not_summarised": [name for name in posterior.latent if name not in small],
         "warnings": list(_warnings(rows, diverging, posterior)),
         "chains": posterior.chains,
         "draws": posterior.draws_per_chain,
         "diverging": diverging,
         "provenance": json.loads(json.dumps(posterior.provenance, sort_keys=True)),
+    }
+
+
+def summarised(posterior: Posterior) -> list[str]:
+    """The latent sites with few enough entries to tell of each."""
+    sizes = {name: int(np.prod(posterior.draws[name].shape[2:])) for name in posterior.latent}
+    return [name for name, size in sizes.items() if size <= LARGEST]
+
+
+def _by_label(contractions: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """Contractions by the labels of the rows."""
+    return {
+        f"{name}[{','.join(map(str, index))}]" if index else name: float(values[index])
+        for name, values in contractions.items()
+        for index in np.ndindex(values.shape)
     }
 
 
@@ -62,6 +83,9 @@ def _warnings(rows: dict[str, dict[str, Any]], diverging: int, posterior: Poster
     few = [name for name, row in rows.items() if row.get("ess", math.inf) < ENOUGH_DRAWS]
     if few and posterior.chains > 1:
         yield f"Fewer than {ENOUGH_DRAWS:.0f} effective draws of {_some(few)}: run longer."
+    idle = [name for name, row in rows.items() if row.get("contraction", 1.0) < UNIDENTIFIED]
+    if idle:
+        yield f"The data say nothing of {_some(idle)} (not identified): the posterior is the prior."
     if not np.all(posterior.extra.get("converged", True)):
         yield "The search or the fit of the engine did not converge: give it more steps, or more starts."
     if float(np.max(posterior.extra.get("pareto_k", 0.0))) > LARGEST_PARETO_K:
