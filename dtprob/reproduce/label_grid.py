@@ -31,6 +31,8 @@ FOLDS: Final = (2, 5, 10)
 SCHEMES: Final = ("erm", "cppi", "tuned_cppi")
 LEVEL: Final = 0.9
 _BATCH: Final = 500
+_UNTRAINED: Final = ("perfect", "useless")
+"""Qualities of predictors that are given, so that folds make no difference."""
 
 
 class Cell(NamedTuple):
@@ -54,10 +56,14 @@ class Cell(NamedTuple):
 
 def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
     """The grid; see the module."""
-    cells = {
-        setting: Cell(**progress.part(str(tuple(setting)), lambda s=setting: study(key, runs, s)._asdict()))
-        for setting in itertools.starmap(Setting, itertools.product(QUALITIES, LABELLED, UNLABELLED, FOLDS))
-    }
+
+    def cell(setting: Setting) -> Cell:
+        if setting.quality in _UNTRAINED:
+            setting = setting._replace(folds=FOLDS[0])
+        return Cell(**progress.part(str(tuple(setting)), lambda: study(key, runs, setting)._asdict()))
+
+    settings = itertools.starmap(Setting, itertools.product(QUALITIES, LABELLED, UNLABELLED, FOLDS))
+    cells = {setting: cell(setting) for setting in settings}
     ratios = {setting: cell.ratio for setting, cell in cells.items()}
     coverages = {setting: float(cell.coverage[2]) for setting, cell in cells.items()}
     worst = max(ratios, key=lambda setting: ratios[setting])
