@@ -97,7 +97,7 @@ def test_surfaces_between_nodes_are_right_to_second_order():
     assert np.log(errors[0] / errors[1]) / np.log(1.5) > 1.8
 
 
-def test_the_absorbing_layer_reflects_less_than_60_db():
+def test_the_absorbing_layer_reflects_less_than_90_db():
     """Against the same scene in so wide an air that its edges cannot be heard yet; a wall runs into the layer."""
     wall = ground(CONCRETE)
     near = field(wall, keep_record=True).record
@@ -107,12 +107,13 @@ def test_the_absorbing_layer_reflects_less_than_60_db():
     assert near is not None
     assert far is not None
     echo = np.abs(near - far).max(axis=1) / np.abs(far).max(axis=1)
-    assert 20 * np.log10(echo.max()) < -60
+    assert 20 * np.log10(echo.max()) < -90
 
 
 def test_beamz_sees_the_same_field():
     """An independent simulation (plain Yee scheme) of a wall and a metal block, at 94 places."""
-    beamz = pytest.importorskip("beamz")
+    import beamz
+
     cells, side, step_count = 40, 200, 1200
     spacing = WAVELENGTH / cells
     width = side * spacing
