@@ -11,6 +11,7 @@ FIGURES: Final[Mapping[str, str]] = {
     "collection": "dtprob.reproduce.network_collection",
     "fig2": "dtprob.reproduce.fig2",
     "prediction": "dtprob.reproduce.prediction",
+    "fig5": "dtprob.reproduce.fig5",
     "fig6a": "dtprob.reproduce.fig6a",
     "fig6b": "dtprob.reproduce.fig6b",
     "fig7": "dtprob.reproduce.fig7",
