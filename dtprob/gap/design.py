@@ -18,6 +18,10 @@ NEEDED: Final = 3.0
 """Nats of expected evidence that count as telling rivals apart: odds of twenty to one."""
 MOST: Final = 1024
 """Repeats after which a design counts as not resolving."""
+_PLACES: Final = 4
+"""Designs that a plan joins at most."""
+_POOL: Final = 48
+"""Designs, the best ones alone, from which plans are made."""
 
 
 class Prediction(NamedTuple):
@@ -101,15 +105,39 @@ def rank(designs: Sequence[Design], needed: float = NEEDED, most: int = MOST) ->
         most: repeats beyond which no design is followed.
     """
     found = [_repeated(design, needed, most) for design in designs]
-    return sorted(found, key=lambda one: (not one.resolves, one.cost if one.resolves else -one.nats))
+    return sorted(found, key=_price)
 
 
-def joined(designs: Sequence[Design], where: Mapping[str, Any]) -> Design:
+def recommend(designs: Sequence[Design], needed: float = NEEDED, most: int = MOST) -> Ranked:
+    """The cheapest plan that is found: one design or several, all repeated alike, joined one by one while that is cheaper.
+
+    Several places together can tell what each alone cannot, as a slope from a level.
+
+    Args:
+        designs: the candidates; the rivals' predictions have the same parameters in each.
+        needed: nats that are enough.
+        most: repeats beyond which no plan is followed.
+    """
+    order = {id(one): number for number, one in enumerate(designs)}
+    pool = sorted(designs, key=lambda one: _price(_repeated(one, needed, most)))[:_POOL]
+    chosen = [pool[0]]
+    best = _repeated(pool[0], needed, most)
+    while len(chosen) < _PLACES:
+        plans = [joined([*chosen, other]) for other in pool]
+        found = [_repeated(plan, needed, most) for plan in plans]
+        number = min(range(len(pool)), key=lambda k: _price(found[k]))
+        if _price(found[number]) >= _price(best):
+            break
+        chosen.append(pool[number])
+        best = found[number]
+    return best._replace(where=_merged([one.where for one in sorted(chosen, key=lambda one: order[id(one)])]))
+
+
+def joined(designs: Sequence[Design]) -> Design:
     """Several designs as one that makes them all; rivals' predictions have the same parameters in each.
 
     Args:
         designs: one or more.
-        where: the coordinates of the whole.
     """
     rivals = zip(*(design.predictions for design in designs), strict=True)
     predictions = tuple(
@@ -120,7 +148,22 @@ def joined(designs: Sequence[Design], where: Mapping[str, Any]) -> Design:
         )
         for parts in rivals
     )
+    where = _merged([design.where for design in designs])
     return Design(where, sum(design.cost for design in designs), predictions)
+
+
+def _merged(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Coordinates of several designs: one value where all agree, else a list in their order."""
+    merged: dict[str, Any] = {}
+    for axis in dict.fromkeys(axis for place in places for axis in place):
+        values = [place[axis] for place in places if axis in place]
+        merged[axis] = values[0] if all(value == values[0] for value in values) else values
+    return merged
+
+
+def _price(one: Ranked) -> tuple[bool, float]:
+    """By what designs are ordered."""
+    return (not one.resolves, one.cost if one.resolves else -one.nats)
 
 
 def _repeated(design: Design, needed: float, most: int) -> Ranked:

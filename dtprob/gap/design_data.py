@@ -11,7 +11,7 @@ from jaxtyping import Float
 from dtprob.errors import InputError
 from dtprob.gap import whiten
 from dtprob.gap.active import activate, basis
-from dtprob.gap.design import Design, Prediction, Ranked, joined, rank
+from dtprob.gap.design import Design, Prediction, Ranked, joined, rank, recommend
 from dtprob.gap.diagnosis import Cause
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fit import Fit
@@ -38,8 +38,8 @@ def next_measurement(
             beside those that are there, measured again. Observed values in them are not looked at.
 
     Returns:
-        For report.json: the classes, the recommended design with its repeats and what it brings, what the same costs by
-        repeating everything, and the best designs in order.
+        For report.json: the classes, the recommended designs with their repeats and what they bring, what the same costs by
+        repeating everything, and the best single designs in order.
     """
     if not causes or len(causes[0].alias_class) < 2:
         return None
@@ -49,9 +49,8 @@ def next_measurement(
     candidates = list(again)
     for name, data in designs.items():
         candidates += designs_of(_problem_at(step.problem, data), step.problem, fits, name)
-    ranked = rank(candidates)
-    everything = rank([joined(again, {"design": _AGAIN})])[0]
-    best = ranked[0]
+    everything = rank([joined(again)])[0]
+    best = recommend(candidates)
     return {
         "split": [list(names) for names in causes[0].alias_class],
         "design": dict(best.where),
@@ -60,7 +59,7 @@ def next_measurement(
         "resolves": best.resolves,
         "cost": best.cost,
         "cost_of_all_again": everything.cost if everything.resolves else None,
-        "ranking": [_line(one) for one in ranked[:_SHOWN]],
+        "ranking": [_line(one) for one in rank(candidates)[:_SHOWN]],
     }
 
 

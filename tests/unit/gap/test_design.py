@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dtprob.gap.design import Design, Prediction, expected_evidence, joined, rank, resolution
+from dtprob.gap.design import Design, Prediction, expected_evidence, joined, rank, recommend, resolution
 
 RNG = np.random.default_rng(0)
 
@@ -83,11 +83,20 @@ def test_repeats_do_not_tell_apart_what_a_nuisance_hides_but_another_place_does(
         Design({"row": k}, 1.0, tuple(Prediction(np.array([m]), *level) for m in (0.0, gap)))
         for k, gap in enumerate((3.0, -3.0))
     )
-    both = joined([first, second], {"row": [0, 1]})
-    ranked = rank([first, second, both])
-    assert ranked[0].where == {"row": [0, 1]}
-    assert ranked[0].repeats == 1
-    assert not ranked[1].resolves
+    assert not any(one.resolves for one in rank([first, second], most=8))
+    both = rank([joined([first, second])], most=8)[0]
+    assert both.resolves
+    assert recommend([second, first], most=8) == both._replace(where={"row": [1, 0]})
+    assert resolution([*joined([first, second]).predictions]) == pytest.approx(9.0, rel=0.02)
+
+
+def test_a_plan_of_one_place_is_the_first_of_the_ranking():
+    none = np.zeros((1, 0)), np.zeros((0, 0))
+    designs = [
+        Design({"row": k}, cost, tuple(Prediction(np.array([m]), *none) for m in (0.0, gap)))
+        for k, (gap, cost) in enumerate([(1.0, 1.0), (3.0, 1.0), (2.9, 1.0)])
+    ]
+    assert recommend(designs) == rank(designs)[0]
 
 
 def linear(x, power):
@@ -125,10 +134,10 @@ def test_the_recommended_measurement_splits_an_aliased_pair():
             rivals = (Prediction(m @ f[0], m, f[1]) for m, f in zip(matrices, fits, strict=True))
             return Design({"row": name}, float(len(rows)), tuple(rivals))
 
-        best = rank([design(places[[k]], k) for k in range(len(places))], needed=4.0)[0]
+        best = recommend([design(places[[k]], k) for k in range(len(places))], needed=4.0)
         more = rank([design(x, "as before")], needed=4.0)[0]
         share.append(best.cost / more.cost if more.resolves else 0.0)
-        new = np.repeat(places[best.where["row"]], best.repeats)
+        new = np.repeat(places[np.atleast_1d(best.where["row"])], best.repeats)
         both = np.concatenate([x, new])
         seen = np.concatenate(
             [y, linear(new, powers[truth]) @ coefficients + noise * rng.standard_normal(len(new))]

@@ -113,7 +113,7 @@ def test_a_diagnosis_recommends_what_splits_its_class():
     costs = [one["cost"] for one in plan["ranking"] if one["resolves"]]
     assert costs == sorted(costs)
     assert plan["cost_of_all_again"] is None or plan["cost"] <= plan["cost_of_all_again"] / 5
-    new = data(np.repeat(wide[plan["design"]["row"]], plan["repeats"]), 2, 4)
+    new = data(np.repeat(wide[np.atleast_1d(plan["design"]["row"])], plan["repeats"]), 2, 4)
     both = {name: jnp.concatenate([before[name], new[name]]) for name in before}
     after = diagnose(line, both, EFFECTS, **options)
     assert after.verdict == "LISTED"
