@@ -28,7 +28,6 @@ from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.modes import find_mode
 from dtprob.inference.optimise import minimise
 from dtprob.inference.posterior import Posterior
-from dtprob.inference.progress import Progress
 from dtprob.inference.resample import (
     WEIGHTS,
     Scheme,
@@ -57,6 +56,18 @@ class Members(NamedTuple):
     fitted: Float[Array, " dimension"]
     positions: Float[Array, "member dimension"]
     converged: Bool[Array, " member"]
+    done: Array
+
+
+class Bags(NamedTuple):
+    """The state of a run that bags another engine, whose draws its steps record.
+
+    Attributes:
+        fitted: the estimate on the data themselves, empty where no noise is drawn about it.
+        done: how many members there are.
+    """
+
+    fitted: Float[Array, " dimension"]
     done: Array
 
 
@@ -108,12 +119,13 @@ class Ensemble(AbstractEngine):
             given = {**data, WEIGHTS: jnp.ones(count)}
             weighted, arrays = build_target(Weighted(model, cluster), given)
             arrays = arrays._replace(location=inputs.location, scale=inputs.scale)
+        job = Job(self, target, inputs, key, options)
         if is_point:
-            job = Job(self, target, inputs, key, options)
             found, _ = iterate(job, self._steps(weighted, arrays, scheme, key))
             positions, failed = np.asarray(found.positions), ~np.asarray(found.converged)
         else:
-            positions, failed = self._bagged(weighted, arrays, scheme, key, options)
+            _, drawn = iterate(job, self._bags(weighted, arrays, scheme, key, options))
+            positions, failed = (np.concatenate(drawn[name]) for name in ("position", "diverging"))
         return assemble(
             target,
             inputs,
@@ -163,33 +175,51 @@ class Ensemble(AbstractEngine):
             note=lambda members: f"{int(jnp.sum(members.converged))} arrived",
         )
 
-    def _bagged(
+    def _bags(
         self, target: Target, inputs: Inputs, scheme: Scheme, key: PRNGKeyArray, options: RunOptions
-    ) -> tuple[Float[np.ndarray, "draw dimension"], Bool[np.ndarray, " draw"]]:
-        """All draws of all members, as positions, and whether they diverged."""
+    ) -> Steps[Bags]:
+        """A step is a member; it records its draws, as positions, and whether they diverged."""
+        engine = self._base()
+        quiet = replace(
+            options, progress=False, status_file=None, checkpoint=None, resume=False, pointwise=False
+        )
+        places = target.compiled(_places)
+
+        def begin() -> Bags:
+            is_noise = scheme == "noise"
+            fitted = self._mode(target, inputs, jax.random.fold_in(key, 0)) if is_noise else jnp.zeros(0)
+            return Bags(fitted, jnp.zeros((), int))
+
+        def step(number: int, before: Bags) -> tuple[Bags, dict[str, Any]]:
+            own = jax.random.fold_in(jax.random.fold_in(key, 1), number)
+            arrays = target.compiled(_resampled, scheme)(before.fitted, own, inputs)
+            given: Data = target.data(arrays)
+            found = engine(jax.random.fold_in(own, 1), target.model, given, options=quiet)
+            row = {
+                "position": places({name: found.flat(name) for name in found.latent}, inputs),
+                "diverging": np.ravel(found.sample_stats["diverging"]),
+            }
+            return before._replace(done=before.done + 1), row
+
+        return Steps(
+            begin,
+            step,
+            finished=lambda bags: int(bags.done) >= self.members,
+            most=self.members,
+            phase="members",
+            note=lambda _: "",
+        )
+
+    def _base(self) -> AbstractEngine:
+        """The engine that each member is given to."""
         from dtprob.inference.fit import resolve  # noqa: PLC0415  (which knows this engine)
 
         if self.base == self.name:
             raise InputError("base of engine ensemble", "another engine", self.base, 'Give "point" or "nuts"')
-        engine = resolve(self.base, **(self.settings or {}))
-        quiet = replace(
-            options, progress=False, status_file=None, checkpoint=None, resume=False, pointwise=False
-        )
-        is_noise = scheme == "noise"
-        fitted = self._mode(target, inputs, jax.random.fold_in(key, 0)) if is_noise else jnp.zeros(0)
-        places = target.compiled(_places)
-        positions: list[np.ndarray] = []
-        diverging: list[np.ndarray] = []
-        with Progress(self.name, self.members, options.progress, options.status_file) as progress:
-            for number in range(self.members):
-                own = jax.random.fold_in(jax.random.fold_in(key, 1), number)
-                arrays = target.compiled(_resampled, scheme)(fitted, own, inputs)
-                given: Data = target.data(arrays)
-                found = engine(jax.random.fold_in(own, 1), target.model, given, options=quiet)
-                positions.append(np.asarray(places({n: found.flat(n) for n in found.latent}, inputs)))
-                diverging.append(np.ravel(found.sample_stats["diverging"]))
-                progress.report(number + 1, "members")
-        return np.concatenate(positions), np.concatenate(diverging)
+        if (self.settings or {}).get("enough_ess"):
+            remedy = "Leave enough_ess out, so that members have equally many draws"
+            raise InputError("settings of engine ensemble", "no early stop", "enough_ess", remedy)
+        return resolve(self.base, **(self.settings or {}))
 
 
 def _places(target: Target, values: Mapping[str, Array], inputs: Inputs) -> Float[Array, "draw dimension"]:

@@ -87,7 +87,7 @@ def test_what_it_refuses(tmp_path):
     for text, settings in attempts.items():
         with pytest.raises(InputError, match=text):
             fit_each(normal, data, ["y"], key=KEY, **settings)
-    with pytest.raises(InputError, match="argument 'z'|'z'"):
+    with pytest.raises(InputError, match="'z'"):
         fit_each(normal, data, ["z"], key=KEY)
     with pytest.raises(InputError, match="one common length, 1 or more, got a scalar"):
         fit_each(normal, data, ["noise"], key=KEY)
