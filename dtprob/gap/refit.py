@@ -17,6 +17,8 @@ _LINES = 12
 """Parameters of an effect along which starting points are looked for."""
 _BETTER = 0.5
 """Nats by which another optimum has to be higher."""
+_FAINT = 0.1
+"""First standard deviation of a field, in its own unit or, where that is small, of its largest plausible one."""
 _REACH = 0.4
 """Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
@@ -32,7 +34,7 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     """
     names = (*fitted.effects, effect.name)
     if effect.kind == "variance":
-        return fitting.fit(problem, fitted.x, names)
+        return fitting.fit(problem, fitted.x, names, spread=max(_FAINT, _FAINT * float(scales(effect).max())))
     return max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
 
 

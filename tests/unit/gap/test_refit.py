@@ -1,0 +1,27 @@
+"""Refits with one more effect."""
+
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects import catalogue
+from dtprob.gap import fit as fitting
+from dtprob.gap.problem import Problem
+from dtprob.gap.refit import refit
+from dtprob.models.declaration import declare
+from dtprob.models.label_twin import label_twin
+
+
+def test_a_field_whose_unit_is_small_is_found():
+    """Offsets of 2.5 dB in 36 cells of about 11 labels, errors of 4 dB: a field of 0.1 dB is too faint to start from."""
+    rng = np.random.default_rng(2)
+    x = rng.uniform(size=(400, 2))
+    cell = (np.floor(6 * x) @ [6, 1]).astype(int)
+    prediction = -80 + 10 * rng.standard_normal(400)
+    y = prediction + 2.5 * rng.standard_normal(36)[cell] + 4 * rng.standard_normal(400)
+    data = {"x": jnp.asarray(x), "prediction": jnp.asarray(prediction), "y": jnp.asarray(y)}
+    effects = catalogue(declare(label_twin, data).sites, data, use="stale_map")
+    problem = Problem(label_twin, data, effects).with_live(["stale_map"])
+    base = fitting.fit(problem, problem.null() + np.log(4.0))
+    found = refit(problem, base, effects[0], [])
+    assert 1.5 < found.spread["stale_map"] < 3.5
+    assert found.log_evidence > base.log_evidence + 10
