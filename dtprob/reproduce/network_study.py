@@ -131,7 +131,7 @@ class Campaign(NamedTuple):
     learner: COMA = COMA()
     budget: Budget = Budget(slots=120_000)
     kernel: Kernel = TWIN
-    starts: int = 12
+    starts: int = 4
 
     def policies(
         self, key: PRNGKeyArray, samplers: Sequence[Sampler]
