@@ -1,5 +1,6 @@
 """Figure 8: the twin's rays are right, what is foreseen follows the model, and knowing of phase errors pays."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -8,7 +9,7 @@ from scipy.constants import epsilon_0, speed_of_light
 
 from dtprob.physical.wave import CONCRETE, cost
 from dtprob.raytracing.calibration import Calibration
-from dtprob.reproduce import fig8
+from dtprob.reproduce import fig8, fig8_scene
 from dtprob.reproduce.fig8_scene import (
     BANDWIDTHS,
     CARRIER,
@@ -102,6 +103,16 @@ def test_the_file_is_of_this_scene():
     assert np.allclose(corners, np.round(corners))
 
 
+def test_the_command_that_makes_the_file_anew(tmp_path, monkeypatch):
+    made = fig8_scene.Simulated(np.ones((3, 3, 64), complex), 0.01, 17.0)
+    monkeypatch.setattr(fig8_scene, "simulate_scene", lambda cells, report: made._replace(cells=cells))
+    monkeypatch.setattr("sys.argv", ["fig8_scene", str(tmp_path / "field.npz"), "17"])
+    fig8_scene.main()
+    found = read_simulated(tmp_path / "field.npz")
+    assert np.array_equal(found.channel, made.channel)
+    assert (found.tail, found.cells) == (0.01, 17.0)
+
+
 def test_the_profile_has_the_power_of_the_channel():
     channel = np.exp(1j * np.arange(64.0)) * np.linspace(1, 2, 64)
     delay, power = profile(channel, FREQUENCY)
@@ -135,8 +146,6 @@ def test_the_expected_profile_is_the_mean_over_phase_errors():
 
 
 def _masked(paths, only):
-    import equinox as eqx
-
     return eqx.tree_at(lambda p: p.mask, paths, paths.mask & only)
 
 
