@@ -72,7 +72,16 @@ def main() -> None:
         "unit": "ms; processor: of all threads; clock: of the wall; first_call: of dtprob, by the clock",
         "rows": rows,
     }
-    report("prediction_powered", result, write=options.write)
+    report("prediction_powered", joined(result, RESULTS / "prediction_powered.json"), write=options.write)
+
+
+def joined(result: dict[str, Any], file: Path) -> dict[str, Any]:
+    """The result with what a file holds of other estimators and numbers of unlabelled samples."""
+    new = {(row["estimator"], row["unlabelled"]) for row in result["rows"]}
+    old = json.loads(file.read_text())["rows"] if file.is_file() else []
+    kept = [row for row in old if (row["estimator"], row["unlabelled"]) not in new]
+    rows = sorted([*kept, *result["rows"]], key=lambda row: (row["unlabelled"], row["estimator"]))
+    return result | {"rows": rows}
 
 
 def arguments() -> argparse.Namespace:
@@ -80,6 +89,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Prediction-powered estimates against ppi-python.")
     parser.add_argument("--labelled", type=int, default=1000)
     parser.add_argument("--unlabelled", type=int, nargs="+", default=[100_000, 1_000_000])
+    parser.add_argument("--estimators", nargs="+", help="only these; what else was measured is kept")
     parser.add_argument("--rounds", type=int, default=5)
     parser.add_argument("--memory", type=int, default=0)
     parser.add_argument("--write", action="store_true")
@@ -125,6 +135,8 @@ def compared(rival: ModuleType, options: argparse.Namespace, count: int) -> list
     for binary in (False, True):
         data = drawn(options.labelled, count, binary=binary)
         for name, (ours, theirs) in pairs(rival, data, binary=binary).items():
+            if options.estimators and name not in options.estimators:
+                continue
             rounds = 1 if name in SLOW else options.rounds
             first, times = in_turns({"dtprob": ours, "ppi_python": theirs}, rounds, warm=name not in SLOW)
             row: dict[str, Any] = {"estimator": name, "unlabelled": count}
@@ -154,7 +166,7 @@ def pairs(rival: ModuleType, data: Arrays, *, binary: bool) -> dict[str, tuple[S
     alpha = 1 - LEVEL
 
     def ours(loss: str, scheme: str) -> Step:
-        features = {} if loss == "mean" else {"x": x, "x_unlabelled": x_unlabelled}
+        features: dict[str, Any] = {} if loss == "mean" else {"x": x, "x_unlabelled": x_unlabelled}
         predictions = each if scheme == "cppi" else one
 
         def step() -> Any:
@@ -165,7 +177,7 @@ def pairs(rival: ModuleType, data: Arrays, *, binary: bool) -> dict[str, tuple[S
         return step
 
     def resampled(loss: str) -> Step:
-        features = {} if loss == "mean" else {"x": x, "x_unlabelled": x_unlabelled}
+        features: dict[str, Any] = {} if loss == "mean" else {"x": x, "x_unlabelled": x_unlabelled}
 
         def step() -> Any:
             sample = Sample(y=y, prediction=own, prediction_unlabelled=one, **features)

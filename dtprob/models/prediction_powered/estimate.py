@@ -78,7 +78,8 @@ def _checked(scheme: Scheme, lam: float | None, level: float) -> Scheme:
 
 def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
     practice, lam = problem.practice, fixed(problem.first_lambda, problem.start)
-    theta = problem.solve(lam, problem.theta, problem.start)
+    tells_all = problem.is_translation and problem.rounds > 0
+    theta = problem.theta if tells_all else problem.solve(lam, problem.theta, problem.start)
     evaluation = problem.at(theta)
     for _ in range(problem.rounds):
         lam = tune(evaluation, problem.inverse(evaluation, lam), by, practice)
@@ -123,7 +124,23 @@ def _check_contexts(by: By, sample: Sample, practice: Practice) -> None:
 def _problem(loss: AbstractLoss, sample: Sample, scheme: Scheme, practice: Practice) -> _Problem:
     xp = np if loss.traits.numpy else jnp
     theta = loss.start(xp.asarray(sample.features), xp.asarray(sample.y))
+    if loss.traits.linear_in_label and not loss.traits.quadratic and sample.n_unlabelled > sample.n:
+        theta = _labels_alone(loss, sample, theta)
     return _Problem(loss, sample, scheme, practice, theta, evaluate(loss, sample, theta))
+
+
+def _labels_alone(
+    loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"]
+) -> Float[Values, " parameter"]:
+    """What labels alone say, from where fewer passes over the unlabelled samples are left; or theta."""
+    alone = Sample(x=sample.features, y=sample.y, weight=sample.weight)
+    start = evaluate(loss, alone, theta)
+    try:
+        return minimise(
+            loss, alone, named_scheme("erm").mix(start.n, start.n, 0 * start.n[None]), start, theta
+        )
+    except InputError:
+        return theta
 
 
 @final

@@ -11,6 +11,7 @@ from typing import Any, Final, Literal, NamedTuple, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, Scalar
 
@@ -31,7 +32,9 @@ def _exp(eta: Values) -> Values:
 
 
 def _softplus(eta: Values) -> Values:
-    return namespace(eta).logaddexp(eta, 0.0)
+    if namespace(eta) is jnp:
+        return jax.nn.softplus(jnp.asarray(eta))  # engines differentiate it, also at 0
+    return np.maximum(eta, 0.0) + np.log(1 + np.exp(-np.abs(eta)))
 
 
 def _sigmoid(eta: Values) -> Values:

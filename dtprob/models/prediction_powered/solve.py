@@ -43,12 +43,9 @@ def newton(evaluation: Evaluation, mix: Mix) -> Newton:
     xp = namespace(evaluation.gradient)
 
     def total(part: str) -> Values:
-        corrected = xp.tensordot(mix.unlabelled, getattr(unlabelled, part), 1)
-        return (
-            mix.true * getattr(labelled, part)[0]
-            + corrected
-            - xp.tensordot(mix.predicted, getattr(predicted, part), 1)
-        )
+        plus = xp.einsum("c,c...->...", mix.unlabelled, getattr(unlabelled, part))
+        minus = xp.einsum("c,c...->...", mix.predicted, getattr(predicted, part))
+        return mix.true * getattr(labelled, part)[0] + plus - minus
 
     gradient, hessian = total("gradient"), total("hessian")
     diagonal = xp.abs(xp.diagonal(hessian))
@@ -84,8 +81,8 @@ def minimise(
     for _ in range(_MAX_STEPS):
         if bool(np.any(move.curvature < _FLAT * first.curvature)):
             break
-        if loss.traits.quadratic or float(move.decrement) <= tolerance:
-            return theta - move.step
+        if loss.traits.quadratic or float(move.decrement) <= np.sqrt(tolerance):
+            return theta - move.step  # squares what is left of the decrement
         theta, move = _descend(loss, sample, mix, theta, move)
     remedy = (
         "Drop features that tell the labels apart perfectly, add labels, or use a scheme with predictions"
