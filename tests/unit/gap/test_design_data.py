@@ -18,6 +18,7 @@ from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
 
 SIGMA = 0.3
+FAST = Settings(replicates=100, site_replicates=39, candidates=2, polished=1)
 
 
 def line(x, y=None):
@@ -103,7 +104,7 @@ def test_a_new_links_own_level_is_known_by_its_prior_only():
 def test_a_diagnosis_recommends_what_splits_its_class():
     x = np.linspace(0.3, 2.0, 40)
     wide = np.linspace(-3, 3, 7)
-    options = {"key": jax.random.key(0), "engine": Laplace(draws=100), "settings": Settings(replicates=100)}
+    options = {"key": jax.random.key(0), "engine": Laplace(draws=100), "settings": FAST}
     before = data(x, 2, 0)
     found = diagnose(line, before, EFFECTS, designs={"wide": data(wide, 2, 9)}, **options)
     assert found.verdict == "UNDETERMINED"
