@@ -49,13 +49,15 @@ def assemble(
     chains, draws = positions.shape[:2]
     shapes = jax.eval_shape(target.compiled(Target.evaluate), positions[0, 0], inputs)
     kept, left_out = kept_sites(target, shapes, options, chains * draws)
-    pushed = [_pushed(target, inputs, np.asarray(chain), kept, block_size(shapes)) for chain in positions]
+    given = dict(stats or {})
+    size, has_lp = block_size(shapes), "lp" in given
+    pushed = [_pushed(target, inputs, np.asarray(chain), kept, size, has_lp=has_lp) for chain in positions]
     values, pointwise, lp = jax.tree.map(lambda *parts: np.stack(parts), *pushed)
     declaration = target.declaration
     sites = [name for name in declaration.sites if name in values]
     return Posterior(
         draws={name: values[name] for name in sites},
-        sample_stats=independent_stats(lp) | dict(stats or {}),
+        sample_stats=independent_stats(given["lp"] if has_lp else lp) | given,
         log_likelihood=pointwise,
         observed=observed_data(target, inputs),
         axes={name: site.axes for name, site in declaration.sites.items()},
@@ -145,13 +147,19 @@ def block_size(shapes: Evaluation) -> int:
 
 
 def _pushed(
-    target: Target, inputs: Inputs, positions: Float[np.ndarray, "draw dimension"], kept: Kept, block: int
+    target: Target,
+    inputs: Inputs,
+    positions: Float[np.ndarray, "draw dimension"],
+    kept: Kept,
+    block: int,
+    *,
+    has_lp: bool,
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], Float[np.ndarray, " draw"]]:
     """A chain's draws pushed through the model by one program of one shape.
 
     Programs of other shapes round otherwise, and a draw shall not depend on how many there are.
     """
-    through = target.compiled(push, kept)
+    through = target.compiled(push, kept, has_lp)
     padded = np.concatenate([positions, np.repeat(positions[-1:], -len(positions) % block, axis=0)])
     blocks = [
         jax.tree.map(np.asarray, through(padded[begin : begin + block], inputs))
@@ -161,14 +169,15 @@ def _pushed(
 
 
 def push(
-    target: Target, kept: Kept, positions: Float[Array, "draw dimension"], inputs: Inputs
+    target: Target, kept: Kept, has_lp: bool, positions: Float[Array, "draw dimension"], inputs: Inputs
 ) -> tuple[dict[str, Array], dict[str, Array], Float[Array, " draw"]]:
-    """Values, pointwise log likelihoods and log density of each draw."""
+    """Values, pointwise log likelihoods and log density of each draw; 0 for the last where it is known already."""
 
     def one(u: Float[Array, " dimension"]) -> tuple[dict[str, Array], dict[str, Array], Array]:
         run = target.evaluate(u, inputs)
         values = {name: run.values[name] for name in kept[0]}
         pointwise = {name: run.log_likelihood[name] for name in kept[1]}
-        return values, pointwise, sum(run.terms, start=jnp.zeros(()))
+        zero = jnp.zeros(())
+        return values, pointwise, zero if has_lp else sum(run.terms, start=zero)
 
     return jax.vmap(one)(positions)

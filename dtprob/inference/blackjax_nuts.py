@@ -68,6 +68,7 @@ class BlackJAXKernel:
             self.max_tree_depth,
         )
         stats = Stats(
+            moved.logdensity,
             info.is_divergent,
             info.energy,
             info.num_trajectory_expansions,

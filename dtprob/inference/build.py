@@ -44,7 +44,7 @@ def build_target(model: Model, data: Data) -> tuple[Target, Inputs]:
     arrays = jax.tree.map(jnp.asarray, arrays)
     target = _TARGETS.get(model, arrays, static)
     bare = Inputs(arrays, jnp.zeros(target.dimension), jnp.ones(target.dimension))
-    draws = target.compiled(Target.prior_draws)(jax.random.key(0), bare, {})
+    draws = target.once(Target.prior_draws)(jax.random.key(0), bare, {})
     return target, Inputs(arrays, *prior_units(target, np.asarray(draws)))
 
 

@@ -134,6 +134,8 @@ def _step(  # noqa: PLR0917
     move_key, winding_key = jax.random.split(key)
     state, stats = walk.kernel.step(target, move_key, chain.kernel, number, Place(chain.centre, inputs))
     chain = chain._replace(kernel=state)
+    window = window_of(target, walk.kernel.position(state), chain.centre)
+    stats = stats._replace(lp=stats.lp - window)
     if target.angles.size:
         chain = _turn(target, walk, chain, winding_key, number)
     return chain, {"position": walk.kernel.position(chain.kernel), **stats._asdict()}

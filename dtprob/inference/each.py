@@ -207,7 +207,8 @@ def _posterior(
     first = _taken(inputs, own, 0)
     shapes = jax.eval_shape(target.compiled(Target.evaluate), positions[0, 0, 0], first)
     kept, left_out = kept_sites(target, shapes, options, count * chains * draws)
-    values, pointwise, lp = _pushed(target, inputs, tuple(own), positions, kept, block_size(shapes))
+    has_lp, size = "lp" in drawn, block_size(shapes)
+    values, pointwise, lp = _pushed(target, inputs, tuple(own), positions, kept, size, has_lp=has_lp)
     declaration = target.declaration
     sites = [name for name in declaration.sites if name in values]
     stats = independent_stats(lp) | {name: np.moveaxis(value, 0, 2) for name, value in drawn.items()}
@@ -234,11 +235,13 @@ def _pushed(  # noqa: PLR0917
     positions: Float[np.ndarray, "member chain draw dimension"],
     kept: Kept,
     block: int,
+    *,
+    has_lp: bool,
 ) -> tuple[Values, Values, np.ndarray]:
     """Values, pointwise log likelihoods and log densities, each (chain, draw, member, ...)."""
     count, chains, draws, dimension = positions.shape
     flat = positions.reshape(count, -1, dimension)
-    through = target.compiled(_push_each, kept, own)
+    through = target.compiled(_push_each, kept, has_lp, own)
     blocks = [
         jax.tree.map(np.asarray, through(flat[:, begin : begin + block], inputs))
         for begin in range(0, flat.shape[1], block)
@@ -251,7 +254,8 @@ def _pushed(  # noqa: PLR0917
     return jax.tree.map(laid_out, *blocks)
 
 
-def _push_each(target: Target, kept: Kept, own: tuple[str, ...], positions: Array, inputs: Inputs) -> Any:
-    return jax.vmap(functools.partial(push, target, kept), in_axes=(0, stacked_axes(inputs, own)))(
-        positions, inputs
-    )
+def _push_each(  # noqa: PLR0917
+    target: Target, kept: Kept, has_lp: bool, own: tuple[str, ...], positions: Array, inputs: Inputs
+) -> Any:
+    axes = (0, stacked_axes(inputs, own))
+    return jax.vmap(functools.partial(push, target, kept, has_lp), in_axes=axes)(positions, inputs)

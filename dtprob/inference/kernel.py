@@ -24,8 +24,18 @@ class Place(NamedTuple):
 
 
 class Stats(NamedTuple):
-    """Statistics of one transition, each a scalar."""
+    """Statistics of one transition, each a scalar.
 
+    Attributes:
+        lp: log density that the kernel walks on, where it ended.
+        diverging: whether the trajectory left the typical set for good.
+        energy: of the place, with its momentum.
+        tree_depth: doublings of the trajectory.
+        acceptance_rate: mean over the trajectory.
+        step_size: of the leapfrog steps.
+    """
+
+    lp: Array
     diverging: Array
     energy: Array
     tree_depth: Array

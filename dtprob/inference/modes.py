@@ -129,11 +129,11 @@ def starting_points(
         values: constrained values of the sites that are given.
         starts: how many.
     """
-    first = target.compiled(Target.prior_median)(inputs, values)[None]
+    first = target.once(Target.prior_median)(inputs, values)[None]
     if starts == 1:
         return first
-    drawn = target.compiled(Target.prior_draws)(key, inputs, values)[: _CANDIDATES * (starts - 1)]
-    heights = target.compiled(_heights, objective)(drawn, inputs)
+    drawn = target.once(Target.prior_draws)(key, inputs, values)[: _CANDIDATES * (starts - 1)]
+    heights = target.once(_heights, objective)(drawn, inputs)
     return jnp.concatenate([first, drawn[jnp.argsort(heights)[: starts - 1]]])
 
 

@@ -43,7 +43,10 @@ class NumPyroKernel:
         jax.eval_shape(functools.partial(start, place=place, key=key), state.z)  # binds the warm-up's length
         moved: HMCState = step(state._replace(rng_key=key), model_args=(place,))
         depth = jnp.floor(jnp.log2(jnp.maximum(moved.num_steps, 1))).astype(int) + 1
-        stats = Stats(moved.diverging, moved.energy, depth, moved.accept_prob, moved.adapt_state.step_size)
+        lp = -jnp.asarray(moved.potential_energy)
+        stats = Stats(
+            lp, moved.diverging, moved.energy, depth, moved.accept_prob, moved.adapt_state.step_size
+        )
         return _without_keys(moved), stats
 
     def position(self, state: HMCState) -> Float[Array, " dimension"]:

@@ -146,7 +146,7 @@ class Loop:
         ):
             while done < total and not self._is_enough(done, kept):
                 if done == self.walk.explore > 0:
-                    groups = [self._compiled(recentre)(group, self.inputs) for group in groups]
+                    groups = [self.target.once(recentre, self.walk)(group, self.inputs) for group in groups]
                 end = self._chunk_end(done)
                 advanced = functools.partial(self._advance, move, done, end)
                 found = list(pool.map(advanced, groups, key_groups))
@@ -201,7 +201,7 @@ class Loop:
         self, keys: list[PRNGKeyArray], wanted: Mapping[str, Any]
     ) -> tuple[int, list[Chain], list[dict[str, np.ndarray]]]:
         path = self.options.checkpoint
-        begin = self._compiled(start)
+        begin = self.target.once(start, self.walk)
         if not self.options.resume or path is None or not path.exists():
             points = [self._starting_points(group) for group in keys]
             return 0, [begin(at, group, self.inputs) for at, group in zip(points, keys, strict=True)], []

@@ -22,6 +22,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 from numpyro import handlers
 from numpyro.infer.util import compute_log_probs
@@ -129,6 +130,20 @@ class Target:
         handle = (function, static)
         if handle not in self._compiled:
             self._compiled[handle] = jax.jit(functools.partial(function, self, *static))
+        return self._compiled[handle]
+
+    def once(self, function: Callable[..., Any], *static: Any) -> Callable[..., Any]:
+        """As `compiled`, for what runs once in a fit: without the optimisation that takes longer than such a run.
+
+        Inside another compiled function it is the function itself.
+        """
+        handle = (function, static, "once")
+        if handle not in self._compiled:
+            plain = functools.partial(function, self, *static)
+            quick = jax.jit(plain, compiler_options={"xla_backend_optimization_level": 0})
+            self._compiled[handle] = lambda *arguments: (plain if _is_traced(arguments) else quick)(
+                *arguments
+            )
         return self._compiled[handle]
 
     def data(self, inputs: Inputs) -> dict[str, Any]:
@@ -245,6 +260,10 @@ class Target:
         trace = trace_model(self.model, self.data(inputs), key, values)
         free = {name: free_value(trace[name]) for name in self.coordinates}
         return (self.ravel(free) - inputs.location) / inputs.scale
+
+
+def _is_traced(arguments: tuple[Any, ...]) -> bool:
+    return any(isinstance(leaf, Tracer) for leaf in jax.tree.leaves(arguments))
 
 
 def _shaped(name: str, value: Any, shape: tuple[int, ...]) -> Array:

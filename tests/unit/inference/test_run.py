@@ -14,6 +14,7 @@ import pytest
 from dtprob.errors import InputError
 from dtprob.inference import NUTS, BlackJAXNUTS, RunOptions, summary
 from dtprob.inference import run as run_module
+from dtprob.inference.build import build_target
 from tests.unit.inference.examples import (
     at_the_cut,
     at_the_cut_data,
@@ -231,6 +232,42 @@ def test_stops_early_once_there_is_enough(tmp_path):
 def test_silent_by_default(capfd):
     NUTS(**SHORT)(KEY, normal, normal_data())
     assert capfd.readouterr() == ("", "")
+
+
+def test_memory_on_the_device_does_not_grow_with_draws(monkeypatch):
+    """Bytes of all live arrays at each report; 100,000 draws with their statistics would be 4.8 MB."""
+    report, held = run_module.Progress.report, []
+
+    def reporting(*arguments):
+        held.append(sum(array.nbytes for array in jax.live_arrays()))
+        report(*arguments)
+
+    monkeypatch.setattr(run_module.Progress, "report", reporting)
+    most = []
+    for draws in (1_000, 100_000):
+        held.clear()
+        options = RunOptions(pointwise=False, chunk=1000)
+        NUTS(warmup=50, draws=draws, chains=1)(KEY, normal, normal_data(), options=options)
+        most.append(max(held))
+    assert most[1] < most[0] + 100_000
+
+
+def compiled(target):
+    """How many programs there are of each compiled function of a target."""
+    kept = {handle: getattr(f, "_cache_size", None) for handle, f in target._compiled.items()}
+    return {handle: size() for handle, size in kept.items() if size is not None}
+
+
+def test_one_program_for_every_chunk_draw_chain_and_data_set():
+    """Chains are advanced by one compiled function, whatever there is of them."""
+    run = NUTS(warmup=60, draws=50, chains=2)
+    run(KEY, normal, normal_data())
+    target, _ = build_target(normal, normal_data())
+    programs = compiled(target)
+    for chunk, draws, chains, seed in ((7, 50, 2, 1), (100, 333, 3, 2)):
+        engine = NUTS(warmup=60, draws=draws, chains=chains)
+        engine(KEY, normal, normal_data(seed), options=RunOptions(chunk=chunk))
+    assert compiled(target) == programs
 
 
 def test_large_sites_are_left_out_and_named():
