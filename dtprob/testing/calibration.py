@@ -7,6 +7,7 @@ Validating Bayesian inference algorithms with simulation-based calibration (2018
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -139,8 +140,7 @@ def judge(ranks: Int[np.ndarray, " run"]) -> Verdict:
     """
     runs, bins = len(ranks), DRAWS + 1
     inside = int(np.sum((ranks > 0) & (ranks < DRAWS)))
-    counts = np.random.default_rng(0).multinomial(runs, np.full(bins, 1 / bins), _NULL)
-    null = _unevenness(counts)
+    null = _even(runs)
     here = _unevenness(np.bincount(ranks, minlength=bins))
     return Verdict(
         p_value=(1 + int(np.sum(null >= here))) / (1 + _NULL),
@@ -148,6 +148,13 @@ def judge(ranks: Int[np.ndarray, " run"]) -> Verdict:
         coverage_p_value=float(stats.binomtest(inside, runs, (bins - 2) / bins).pvalue),
         mean=float(np.mean(ranks) / DRAWS),
     )
+
+
+@functools.cache
+def _even(runs: int) -> Float[np.ndarray, " study"]:
+    """Unevenness of as many ranks that are even, drawn many times."""
+    bins = DRAWS + 1
+    return _unevenness(np.random.default_rng(0).multinomial(runs, np.full(bins, 1 / bins), _NULL))
 
 
 def _unevenness(counts: Int[np.ndarray, "*study bin"]) -> Float[np.ndarray, " *study"]:
