@@ -32,12 +32,16 @@ def compiled_for_jax[**P, R](function: Callable[P, R]) -> Callable[P, R]:
 
     @wraps(function)
     def call(*args: P.args, **kwargs: P.kwargs) -> R:
-        if any(isinstance(leaf, jax.Array) for leaf in jax.tree.leaves((args, kwargs))):
+        if any(_is_jax(leaf) for leaf in jax.tree.leaves((args, kwargs))):
             return compiled(*args, **kwargs)
         with np.errstate(all="ignore"):
             return function(*args, **kwargs)
 
     return call
+
+
+def _is_jax(leaf: Any) -> bool:
+    return type(leaf) is not np.ndarray and isinstance(leaf, jax.Array)  # the first test is the quicker one
 
 
 def each(function: Callable[[Any], Any], rows: Values) -> Any:

@@ -81,11 +81,12 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
     tells_all = problem.is_translation and problem.rounds > 0
     theta = problem.theta if tells_all else problem.solve(lam, problem.theta, problem.start)
     evaluation = problem.at(theta)
+    inverse = problem.inverse(evaluation, lam)
     for _ in range(problem.rounds):
-        lam = tune(evaluation, problem.inverse(evaluation, lam), by, practice)
+        lam = tune(evaluation, inverse, by, practice)
         theta = problem.solve(lam, theta, evaluation)
         evaluation = problem.at(theta)
-    inverse = problem.inverse(evaluation, lam)
+        inverse = inverse if problem.is_translation else problem.inverse(evaluation, lam)
     found = spread(evaluation, problem.mixes(lam.value), inverse, practice)
     alone = spread(evaluation, problem.mixes(0 * lam.value), inverse, practice)
     covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
@@ -189,6 +190,8 @@ class _Problem:
         if self.is_translation:
             theta = self.theta
         xp = namespace(theta)
+        if (lam.value == lam.value[:1]).all():
+            return self._minimise(xp.asarray(lam.value[0]), theta, evaluation)
         rows, inverse = np.unique(np.asarray(lam.value), axis=0, return_inverse=True)
         found = [self._minimise(xp.asarray(row), theta, evaluation) for row in rows]
         return xp.stack(found)[inverse.reshape(-1), np.arange(len(self.theta))]
