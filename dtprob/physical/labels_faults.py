@@ -114,8 +114,8 @@ def _autocorrelated_errors(_rng: np.random.Generator, _survey: Survey) -> Fault:
 
 
 def _periodic_bias(rng: np.random.Generator, survey: Survey) -> Fault:
-    """The sender's power is cycled with the load, several times during the drive."""
-    periods, phase = int(rng.integers(4, 9)), rng.uniform(0, 2 * np.pi)
+    """The sender's power is cycled with the load, several times on each leg: too fast for a map of places to follow."""
+    periods, phase = BLOCKS * int(rng.integers(4, 9)), rng.uniform(0, 2 * np.pi)
     minutes = survey.x[:, 2]
     shape = np.sin(2 * np.pi * periods * minutes / np.ptp(minutes) + phase)
     return Fault("periodic_bias", None, "dB", _LARGEST_DB, shifted(_blocks(shape)), {"periods": periods})
