@@ -99,14 +99,14 @@ def study(key: PRNGKeyArray, paths: BeamPaths, case: Case) -> Float[np.ndarray, 
     mine, rest = order[: case.n], order[case.n :]
     known, sought, tested = _take(paths, mine), paths.position[rest], rest[:TESTED]
     truth, masks = labels(known, case.arrays), _masks(keys[2], case.n)
-    unlabelled = Unlabelled.of(x[rest], np.zeros((len(rest), case.arrays.entries)))
+    made = {training: synthetic(known, sought, mask, case) for training, mask in masks.items()}
+    unlabelled = Unlabelled.of(x[rest], made["all"][1])
     whole = Labelled(x[mine], truth, truth)
     sources = {"none": (whole, unlabelled)}
-    for training, mask in masks.items():
-        own, other = synthetic(known, sought, mask, case)
-        kept = ~mask[0] if training == "split" else np.ones(case.n, bool)
+    for training, (own, other) in made.items():
+        kept = ~masks["split"][0] if training == "split" else np.ones(case.n, bool)
         labelled = Labelled(whole.x[kept], truth[kept], own[kept])
-        sources[training] = labelled, unlabelled.predicted(other)
+        sources[training] = labelled, unlabelled if training == "all" else unlabelled.predicted(other)
     found: list[tuple[float, float]] = []
     for scheme in SCHEMES.values():
         fit = regress(*sources[scheme.training], scheme, penalty=_PENALTY)
