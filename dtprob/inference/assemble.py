@@ -93,10 +93,11 @@ def data_hash(inputs: Inputs) -> str:
 
 def observed_data(target: Target, inputs: Inputs) -> dict[str, np.ndarray]:
     """The data of each observed site."""
-    return jax.tree.map(np.asarray, target.compiled(_observed)(inputs))
+    return jax.tree.map(np.asarray, target.compiled(observed_sites)(inputs))
 
 
-def _observed(target: Target, inputs: Inputs) -> dict[str, Array]:
+def observed_sites(target: Target, inputs: Inputs) -> dict[str, Array]:
+    """The value of each observed site."""
     trace = trace_model(target.model, target.data(inputs), jax.random.key(0))
     return {name: jnp.asarray(trace[name]["value"]) for name in target.declaration.observed}
 

@@ -18,7 +18,7 @@ from dtprob.inference.assemble import (
     block_size,
     independent_stats,
     kept_sites,
-    observed_data,
+    observed_sites,
     provenance,
     push,
 )
@@ -212,13 +212,13 @@ def _posterior(
     declaration = target.declaration
     sites = [name for name in declaration.sites if name in values]
     stats = independent_stats(lp) | {name: np.moveaxis(value, 0, 2) for name, value in drawn.items()}
-    observed = [observed_data(target, _taken(inputs, own, number)) for number in range(count)]
+    observed = target.compiled(_observed_each, tuple(own))(inputs)
     known = provenance(target, inputs, engine, key)
     return Posterior(
         draws={name: values[name] for name in sites},
         sample_stats=stats,
         log_likelihood=pointwise,
-        observed={name: np.stack([one[name] for one in observed]) for name in observed[0]},
+        observed=jax.tree.map(np.asarray, observed),
         axes=dict.fromkeys(stats, (axis,))
         | {name: (axis, *site.axes) for name, site in declaration.sites.items()},
         latent=tuple(target.coordinates),
@@ -259,3 +259,7 @@ def _push_each(  # noqa: PLR0917
 ) -> Any:
     axes = (0, stacked_axes(inputs, own))
     return jax.vmap(functools.partial(push, target, kept, has_lp), in_axes=axes)(positions, inputs)
+
+
+def _observed_each(target: Target, own: tuple[str, ...], inputs: Inputs) -> dict[str, Array]:
+    return jax.vmap(functools.partial(observed_sites, target), in_axes=(stacked_axes(inputs, own),))(inputs)
