@@ -36,7 +36,6 @@ def compose(
             "p_value": evidence.after.site_p_value,
             "sites": [s.site for s in evidence.after.sites if s.p_value <= settings.level / 2],
         },
-        "next_measurement": _next_measurement(evidence, causes) if verdict == "UNDETERMINED" else None,
         "detectable": [
             {"effect": name, "size": size, "parameter": e.parameters[0].name, "unit": e.parameters[0].unit}
             for name, size, e in zip(first.names, first.detectable, evidence.problem.effects, strict=True)
@@ -203,24 +202,6 @@ def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
         change = np.clip(1 - variance * np.maximum(precision, 0.0), 0.0, 1.0)
         result[block.name] = change if len(change) == size else np.full(size, change.mean())
     return result
-
-
-def _next_measurement(evidence: Evidence, causes: tuple[Cause, ...]) -> dict[str, Any] | None:
-    """The cluster where repeating the measurement tells the two best explanations apart soonest."""
-    if not causes or len(causes[0].alias_class) < 2:
-        return None
-    step = next(s for s in reversed(evidence.steps) if s.accepted is not None)
-    first, second = (c[-1] for c in causes[0].alias_class[:2])
-    a, b = (np.asarray(step.problem.compiled.residual(step.trials[n].x)) for n in (first, second))
-    located = evidence.problem.rows.by_cluster(evidence.problem.rows.located) == 1
-    gain = 0.5 * np.where(located, (a - b) ** 2, 0.0).sum(1)
-    best = int(np.argmax(gain))
-    return {
-        "split": [list(c) for c in causes[0].alias_class[:2]],
-        "design": {evidence.problem.cluster_name: best},
-        "gain_nats": float(gain[best]),
-        "repeats": int(np.ceil(3.0 / max(float(gain[best]), 1e-3))),
-    }
 
 
 def _maps(evidence: Evidence) -> dict[str, xr.Dataset]:
