@@ -50,6 +50,9 @@ ENGINES = {
     "laplace, normal": (Laplace(draws=DRAWS, starts=1), 120),
     "ensemble, normal": (Ensemble(members=DRAWS, starts=1), 120),
     "exact, normal": (Exact(draws=DRAWS), 120),
+    "exact, multi_access": (Exact(draws=DRAWS), 60),
+    "nuts, custom": (NUTS(**SHORT), 60),
+    "blackjax_nuts, phase_error_channel": (BlackJAXNUTS(**SHORT), 30),
 }
 
 
