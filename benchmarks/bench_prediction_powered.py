@@ -5,14 +5,15 @@
 
 Both run in turn in one process, from NumPy arrays to an interval, after one run that does not count (that of
 dtprob is reported as its first call); the figures are the ratios of their least times, of the processors and of
-the clock, which a busy machine changes least. --memory says instead what one
-process needs at most that fits least squares with an interval to so many unlabelled samples in files. --write
-keeps the figures in benchmarks/results.
+the clock, which a busy machine changes least. With OMP_NUM_THREADS=1 threads that only wait do not count.
+--memory says instead what one process needs at most that fits least squares with an interval to so many
+unlabelled samples in files. --write keeps the figures in benchmarks/results.
 """
 
 import argparse
 import datetime as dt
 import json
+import os
 import platform
 import resource
 import shlex
@@ -69,6 +70,7 @@ def main() -> None:
         "command": command,
         "versions": {name: version(name) for name in ("jax", "numpy", "ppi-python")},
         "labelled": options.labelled,
+        "blas_threads": os.environ.get("OMP_NUM_THREADS", "all cores"),
         "unit": "ms; processor: of all threads; clock: of the wall; first_call: of dtprob, by the clock",
         "rows": rows,
     }
