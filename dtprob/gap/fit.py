@@ -67,7 +67,8 @@ def _system(problem: Problem, active: Active, x: np.ndarray) -> System:
     weighted = np.asarray(active.weights)[:, None]
     score = (e[:, None, :] @ w)[:, 0]
     shared, transposed = w[..., :n], np.swapaxes(w, 1, 2)
-    curvature = (shared * weighted[..., None]).reshape(-1, n).T @ shared.reshape(-1, n)
+    flat = (e.size, n)
+    curvature = (shared * weighted[..., None]).reshape(flat).T @ shared.reshape(flat)
     cross, local = transposed[:, :n] @ w[..., n:], transposed[:, n:] @ w[..., n:]
     _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
     prior_gradient = prior_gradient + effect_gradient
