@@ -24,7 +24,7 @@ WAVELENGTH: Final = SPEED_OF_LIGHT / CARRIER
 BANDWIDTHS: Final = (100e6, 200e6, 500e6)
 SUBCARRIERS: Final = 64
 DURATION: Final = 100e-9
-CELLS: Final = 16.0
+CELLS: Final = 20.0
 """Per wavelength; every side of the scene but the far ones of the walls then lies on nodes."""
 THICKNESS: Final = 0.2
 """Of the walls, m."""
