@@ -2,6 +2,7 @@
 
 import runpy
 import shutil
+import sys
 from pathlib import Path
 
 import pytest
@@ -25,6 +26,7 @@ def folder(tmp_path):
 def test_the_table_is_what_its_script_writes(folder, monkeypatch):
     before = (folder / "table.csv").read_bytes()
     monkeypatch.syspath_prepend(str(folder))
+    monkeypatch.delitem(sys.modules, "path_loss", raising=False)  # of another case
     runpy.run_path(str(folder / "make_table.py"), run_name="__main__")
     assert (folder / "table.csv").read_bytes() == before
 
