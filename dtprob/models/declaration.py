@@ -17,9 +17,13 @@ import jax
 import numpy as np
 import numpyro
 from numpyro import handlers
-from numpyro.distributions import constraints
+from numpyro.distributions import constraints, distribution
 
 from dtprob.errors import InputError, nearest
+
+# ArviZ registers NumPyro to be loaded later. Where it was imported first, Python runs numpyro.distributions twice, and the
+# second copy lacks the submodule in which numpyro.factor looks.
+vars(numpyro.distributions)["distribution"] = distribution
 
 type Model = Callable[..., Any]
 type Data = Mapping[str, Any]

@@ -35,3 +35,16 @@ def test_rooms_are_found_by_name():
     assert "data" in dir(dtprob)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
         _ = dtprob.nothing
+
+
+def test_factors_work_where_arviz_was_imported_first():
+    program = """
+import arviz_stats.base
+import dtprob.inference
+import numpyro
+from numpyro import handlers
+trace = handlers.trace(lambda: numpyro.factor("loss", -1.0)).get_trace()
+print(float(trace["loss"]["fn"].log_prob(trace["loss"]["value"])))
+"""
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert float(done.stdout) == -1.0
