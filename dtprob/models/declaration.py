@@ -23,7 +23,7 @@ from dtprob.errors import InputError, nearest
 
 # ArviZ registers NumPyro to be loaded later. Where it was imported first, Python runs numpyro.distributions twice, and the
 # second copy lacks the submodule in which numpyro.factor looks.
-vars(numpyro.distributions)["distribution"] = distribution
+numpyro.distributions.__dict__["distribution"] = distribution
 
 type Model = Callable[..., Any]
 type Data = Mapping[str, Any]
