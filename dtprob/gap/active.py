@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Final
 
 import jax.numpy as jnp
@@ -11,10 +12,11 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.layout import Block
-from dtprob.gap.plausible import prior_scale
+from dtprob.gap.plausible import prior_scale, scales
 from dtprob.gap.problem import Problem
 
 LOG_2PI: Final = float(np.log(2 * np.pi))
+_FAINT: Final = 0.1
 
 
 @dataclass(frozen=True)
@@ -40,13 +42,31 @@ class Active:
 
 
 def activate(
-    problem: Problem, effects: Sequence[str] = (), weights: np.ndarray | None = None, spread: float = 0.1
+    problem: Problem,
+    effects: Sequence[str] = (),
+    weights: np.ndarray | None = None,
+    spread: Mapping[str, float] = MappingProxyType({}),
 ) -> Active:
-    """The base model's nuisances and the named effects, with a weight per cluster (one by default)."""
+    """The base model's nuisances and the named effects.
+
+    Args:
+        problem: in which the effects are live.
+        effects: their names.
+        weights: per cluster, one by default.
+        spread: standard deviation of variance effects' fields by name; those not given get one to start from.
+    """
     chosen = tuple(e for e in problem.live if e.name in effects)
     blocks = [b for b in problem.layout.blocks if b.owner is None or b.owner in effects]
     weights = np.ones(problem.n_cluster) if weights is None else weights
-    return Active(tuple(blocks), chosen, weights, {e.name: spread for e in chosen if e.kind == "variance"})
+    fields = [e for e in chosen if e.kind == "variance"]
+    return Active(
+        tuple(blocks), chosen, weights, {e.name: spread.get(e.name, _first_spread(e)) for e in fields}
+    )
+
+
+def _first_spread(effect: Effect) -> float:
+    """A tenth: in the field's own unit or, where that is more, of its largest plausible standard deviation."""
+    return _FAINT * max(1.0, float(scales(effect).max()))
 
 
 def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:

@@ -72,11 +72,10 @@ def polish(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
     """
     scale = problem.prior_draws(jax.random.key(0), _PRIOR_DRAWS).std(axis=0)
     for _ in range(_ROUNDS):
-        spread = next(iter(fitted.spread.values()), 0.1)
         peaks = _other_peaks(problem, fitted.x, scale)
-        short = [fitting.fit(problem, x, fitted.effects, spread=spread, steps=_SHORT) for x in peaks]
+        short = [fitting.fit(problem, x, fitted.effects, spread=fitted.spread, steps=_SHORT) for x in peaks]
         short.sort(key=lambda f: -f.log_posterior)
-        long = [fitting.fit(problem, f.x, fitted.effects, spread=spread) for f in short[:_LONG]]
+        long = [fitting.fit(problem, f.x, fitted.effects, spread=fitted.spread) for f in short[:_LONG]]
         best = max(long, key=lambda f: f.log_posterior, default=fitted)
         if best.log_posterior < fitted.log_posterior + 0.1:
             return fitted

@@ -55,10 +55,8 @@ def cross_fit(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> 
     estimates: dict[str, list[np.ndarray]] = {b.name: [] for b in blocks}
     for fold in np.unique(assignment):
         held = assignment == fold
-        spread = next(iter(fitted.spread.values()), 0.1)
-        part = fitting.fit(
-            problem, fitted.x, fitted.effects, weights=(~held).astype(float), spread=spread, steps=15
-        )
+        kept = (~held).astype(float)
+        part = fitting.fit(problem, fitted.x, fitted.effects, weights=kept, spread=fitted.spread, steps=15)
         log_likelihood[held] = fitting.marginal(problem, part)[held]
         squares = [np.asarray(v) for v in problem.compiled.prediction_error(part.x)]
         error[held], signal[held] = squares[0][held], squares[1][held]

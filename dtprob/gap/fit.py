@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -107,7 +108,7 @@ def fit(
     weights: np.ndarray | None = None,
     steps: int = 40,
     tolerance: float = 1e-3,
-    spread: float = 0.1,
+    spread: Mapping[str, float] = MappingProxyType({}),
 ) -> Fit:
     """Posterior mode from the starting point x.
 
@@ -118,7 +119,7 @@ def fit(
         weights: per cluster, 0 leaves it out of the fit.
         steps: at most so many Gauss-Newton steps.
         tolerance: stop when the predicted gain in nats falls below.
-        spread: first standard deviation of variance effects' fields.
+        spread: first standard deviation of variance effects' fields by name; see `activate`.
     """
     active = activate(problem, effects, weights, spread)
     x, damping, converged = np.array(x, float), 1e-3, False
@@ -255,8 +256,7 @@ def marginal(problem: Problem, fitted: Fit, *, steps: int = 20) -> np.ndarray:
     Local coordinates are refitted per cluster and integrated out by Laplace's method, so that clusters that the fit has
     not seen are judged fairly.
     """
-    active = activate(problem, fitted.effects)
-    active = replace(active, spread=fitted.spread)
+    active = activate(problem, fitted.effects, spread=fitted.spread)
     x = fitted.x.copy()
     if not active.local_index.shape[1]:
         return _objective(problem, active, x)[1:]

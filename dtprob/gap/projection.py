@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap import fit as fitting
-from dtprob.gap.active import Active, activate, basis, effect_prior
+from dtprob.gap.active import activate, basis, effect_prior
 from dtprob.gap.newton import positive
 from dtprob.gap.problem import Problem
 
@@ -95,14 +95,12 @@ class Projection:
 
 def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     """Projection on the complement of everything that the fit is free to move."""
-    active = activate(problem, fitted.effects)
+    active = activate(problem, fitted.effects, spread=fitted.spread)
     directions = basis(problem, active)
     n = len(active.global_index)
     _, w = problem.compiled.linearised(fitted.x, directions)
     prior_slope, hessian = problem.compiled.prior(fitted.x, directions)
-    _, effect_slope, effect_curvature = effect_prior(
-        problem, Active(active.blocks, active.effects, active.weights, fitted.spread), fitted.x
-    )
+    _, effect_slope, effect_curvature = effect_prior(problem, active, fitted.x)
     w_global, w_local = w[..., :n], w[..., n:]
     local = np.asarray(jnp.einsum("cmi,cmj->cij", w_local, w_local))
     local = local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)

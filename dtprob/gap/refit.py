@@ -17,8 +17,6 @@ _LINES = 12
 """Parameters of an effect along which starting points are looked for."""
 _BETTER = 0.5
 """Nats by which another optimum has to be higher."""
-_FAINT = 0.1
-"""First standard deviation of a field, in its own unit or, where that is small, of its largest plausible one."""
 _REACH = 0.4
 """Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
@@ -34,7 +32,7 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     """
     names = (*fitted.effects, effect.name)
     if effect.kind == "variance":
-        return fitting.fit(problem, fitted.x, names, spread=max(_FAINT, _FAINT * float(scales(effect).max())))
+        return fitting.fit(problem, fitted.x, names)
     return max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
 
 
@@ -79,8 +77,7 @@ def without(
         if effect.name in best and effect.kind == "mean":
             x = trials[effect.name].x.copy()
             x[problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)] = nulls(effect)
-            spread = next(iter(before.spread.values()), 0.1)
-            fits.append(fitting.fit(problem, x, before.effects, spread=spread))
+            fits.append(fitting.fit(problem, x, before.effects, spread=before.spread))
     found = max(fits, key=lambda f: f.log_evidence, default=before)
     return polish(problem, found) if found.log_evidence > before.log_evidence + _BETTER else None
 

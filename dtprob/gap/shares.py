@@ -84,7 +84,8 @@ def shares(
     value = {frozenset(): held[0].log_likelihood, frozenset(effects): held[1].log_likelihood}
     for size in range(1, len(effects)):
         for chosen in combinations(effects, size):
-            part = fitting.fit(problem, _without_others(problem, fitted, chosen), chosen)
+            start = _without_others(problem, fitted, chosen)
+            part = fitting.fit(problem, start, chosen, spread=fitted.spread)
             value[frozenset(chosen)] = cross_fit(problem, part, assignment).log_likelihood
     gained = value[frozenset(effects)] - value[frozenset()]
     if gained.sum() <= 0:

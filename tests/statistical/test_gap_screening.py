@@ -174,7 +174,7 @@ def beside_a_field():
     for seed in range(150):
         level = 0.5 * SIGMA * np.random.default_rng(seed).normal(size=(12, 1))
         use(problem, draw("line", seed=1000 + seed, shift=level))
-        fitted = fitting.fit(problem, problem.null(), ["jitter"], spread=0.5 * SIGMA)
+        fitted = fitting.fit(problem, problem.null(), ["jitter"], spread={"jitter": 0.5 * SIGMA})
         projection = project(problem, fitted)
         drawn = replicate(problem, fitted, projection, jax.random.key(seed), settings)
         found = screen(problem, fitted, projection, drawn, settings)
