@@ -8,8 +8,8 @@ from xarray import DataTree
 
 from dtprob import __version__
 from dtprob.case import Case
-from dtprob.commands.run import Run, chosen, infer, prepare_case, session, write_text
-from dtprob.files import atomic_write
+from dtprob.commands.run import Run, chosen, infer, prepare_case, session
+from dtprob.files import atomic_write, write_text
 from dtprob.gap.diagnose import diagnose
 from dtprob.report import render, to_json
 

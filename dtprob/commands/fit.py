@@ -4,7 +4,8 @@ import json
 from pathlib import Path
 
 from dtprob.case import Case
-from dtprob.commands.run import Run, chosen, infer, prepare_case, session, write_text
+from dtprob.commands.run import Run, chosen, infer, prepare_case, session
+from dtprob.files import write_text
 from dtprob.workflow.identified import contraction
 from dtprob.workflow.summary import summarise, summarised
 

@@ -14,7 +14,7 @@ from dtprob.case import Case, EngineSection
 from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.errors import InputError
-from dtprob.files import atomic_write
+from dtprob.files import write_text
 from dtprob.inference import Posterior, RunOptions
 from dtprob.workflow import Prepared, prepare
 from dtprob.workflow.prepare import sha256
@@ -129,9 +129,3 @@ def _make_folder(out: Path) -> None:
         raise InputError(
             f"--out {out}", "a folder", error.strerror or str(error), "Choose another folder"
         ) from None
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write text to a file, whole or not at all."""
-    with atomic_write(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")

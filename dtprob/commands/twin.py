@@ -8,10 +8,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from dtprob.commands.run import session, write_text
+from dtprob.commands.run import session
 from dtprob.control import TablePolicy, export
 from dtprob.data import NetworkLog, write
 from dtprob.errors import InputError
+from dtprob.files import write_text
 from dtprob.workflow.loop import (
     State,
     Twin,

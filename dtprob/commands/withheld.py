@@ -12,7 +12,7 @@ from typing import Any, Final
 
 from dtprob.commands.progress import Say, telling
 from dtprob.errors import InputError, unknown_name
-from dtprob.files import atomic_write
+from dtprob.files import write_text
 
 TRACKS: Final = {
     "channel": "dtprob.physical.cases",
@@ -20,7 +20,7 @@ TRACKS: Final = {
     "labels": "dtprob.physical.labels_cases",
     "custom": "dtprob.physical.custom_cases",
 }
-"""For each track, the module whose `generate_cases` writes its cases and their key."""
+"""For each track, the module whose `TRACK` writes its cases and their key."""
 
 _SHARED: Final = 4
 """Cases that one worker takes in a row: neighbours are often alike and share compiled programs."""
@@ -59,7 +59,7 @@ def generate(
             if done % 10 == 0 or done == all_:
                 say(f"{done} of {all_}")
 
-        file = module.generate_cases(out, count, seed, kinds, lambdas, resume=True, progress=progress)
+        file = module.TRACK.generate(out, count, seed, kinds, lambdas, resume=True, progress=progress)
         say(f"done: {out / 'cases'}, and the key apart: {file}")
 
 
@@ -113,10 +113,8 @@ def score(answers: Path, key: Path) -> None:
     names = [str(case.get("name")) for case in content.get("cases", [])]
     reports = {name: _report(answers / name) for name in names if (answers / name).is_dir()}
     result = scored(content, reports)
-    with atomic_write(answers / "score.json") as temporary:
-        temporary.write_text(json.dumps(result, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    with atomic_write(answers / "score.html") as temporary:
-        temporary.write_text(render_score(result), encoding="utf-8")
+    write_text(answers / "score.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
+    write_text(answers / "score.html", render_score(result))
     for stratum in result["strata"]:
         print(f"{stratum['kind']}, lambda {stratum['lambda']:g}: {stratum['cases']} cases")
         for name, rate in stratum["rates"].items():
@@ -165,8 +163,7 @@ def _diagnose_all(cases: Path, out: Path, names: Sequence[str], seed: int | None
             answer(load_case(cases / name / "case.toml"), folder, seed=seed, no_code=no_code)
         except Exception as error:  # noqa: BLE001  (one bad case must not end the others)
             failed.append(name)
-            with atomic_write(folder / "error.txt") as temporary:
-                temporary.write_text(f"{type(error).__name__}: {error}\n", encoding="utf-8")
+            write_text(folder / "error.txt", f"{type(error).__name__}: {error}\n")
         else:
             (folder / "error.txt").unlink(missing_ok=True)
     return failed

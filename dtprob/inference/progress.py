@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 from rich.progress import TaskID
 
-from dtprob.files import atomic_write
+from dtprob.files import write_text
 
 
 @dataclass
@@ -68,5 +68,5 @@ class Progress:
             print(line, file=sys.stderr, flush=True)
         if self.status_file is not None:
             status = {"what": self.what, "phase": phase, "done": done, "total": self.total}
-            with atomic_write(self.status_file) as temporary:
-                temporary.write_text(json.dumps(status | {"seconds": round(seconds, 3), "note": note}))
+            status |= {"seconds": round(seconds, 3), "note": note}
+            write_text(self.status_file, json.dumps(status))

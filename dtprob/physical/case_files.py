@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -11,8 +10,9 @@ from jaxtyping import Complex
 
 from dtprob.data.kinds import ChannelData
 from dtprob.data.write import write
-from dtprob.files import atomic_write
+from dtprob.files import write_text
 from dtprob.physical.channel import Sounding
+from dtprob.physical.study import case_end
 from dtprob.physical.world import World
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.storage import save
@@ -59,16 +59,11 @@ def write_case(
         noise_power=np.asarray(noise_power),
     )
     write(folder / "channels.npz", data)
-    with atomic_write(folder / "case.toml") as temporary:
-        temporary.write_text(
-            _toml(nominal, model, phase=phase, used=used, excluded=excluded, seed=seed), encoding="utf-8"
-        )
+    end = case_end(excluded, seed, list(used) or "all")
+    write_text(folder / "case.toml", _toml(nominal, model, phase) + end)
 
 
-def _toml(
-    nominal: World, model: str, *, phase: str, used: Sequence[str], excluded: Sequence[str], seed: int
-) -> str:
-    left_out = f"exclude = {json.dumps(list(excluded))}\n" if excluded else ""
+def _toml(nominal: World, model: str, phase: str) -> str:
     return f"""[model]
 name = "{model}"
 
@@ -82,12 +77,4 @@ frequency = {nominal.frequency!r}
 max_depth = {nominal.max_depth}
 merge_shapes = false
 
-[effects]
-use = {json.dumps(list(used) or "all")}
-{left_out}
-[engine]
-name = "laplace"
-
-[seed]
-value = {seed}
 """

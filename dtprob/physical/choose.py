@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Literal
+from typing import Any, Final
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from dtprob.physical.campaign import Site
 from dtprob.physical.draws import FAMILIES, draw
 from dtprob.physical.impairment import Impairment
 
-type Kind = Literal["null", "listed", "unlisted", "pair", "triple", "alias"]
+KINDS: Final = ("null", "listed", "unlisted", "pair", "triple", "alias")
+"""Of cases."""
 
 FOREIGN: Final = ("beam_squint", "correlated_noise", "dispersive_walls", "pedestrian")
 """Families that no library of effects has."""
@@ -61,23 +62,17 @@ class Choice:
     """What a case holds.
 
     Attributes:
-        kind: of case.
-        target: lambda asked of each effect; 0 without effects.
         effects: the impairments.
         excluded: families taken out of the library for this case.
         alias: name of an effect that looks much like the true one, and their correlation.
     """
 
-    kind: Kind
-    target: float
     effects: tuple[Active, ...] = ()
     excluded: tuple[str, ...] = ()
     alias: tuple[str, float] | None = None
 
 
-def choose(
-    rng: np.random.Generator, kind: Kind, site: Site, target: float, families: Sequence[str]
-) -> Choice:
+def choose(rng: np.random.Generator, kind: str, site: Site, target: float, families: Sequence[str]) -> Choice:
     """The effects of a case.
 
     Args:
@@ -91,17 +86,17 @@ def choose(
         InputError: nothing that fits was found.
     """
     if kind == "null":
-        return Choice(kind, 0.0)
+        return Choice()
     if kind == "listed":
-        return Choice(kind, target, (_sized(rng, site, target, families),))
+        return Choice((_sized(rng, site, target, families),))
     if kind == "unlisted":
         if rng.random() < 1 / 3:
-            return Choice(kind, target, (_sized(rng, site, target, FOREIGN),))
+            return Choice((_sized(rng, site, target, FOREIGN),))
         one = _sized(rng, site, target, families)
-        return Choice(kind, target, (one,), excluded=(one.impairment.family,))
+        return Choice((one,), excluded=(one.impairment.family,))
     if kind == "alias":
         return _aliased(rng, site, target, families)
-    return Choice(kind, target, _several(rng, site, target, families, 2 if kind == "pair" else 3))
+    return Choice(_several(rng, site, target, families, 2 if kind == "pair" else 3))
 
 
 def _sized(rng: np.random.Generator, site: Site, target: float, families: Sequence[str]) -> Active:
@@ -181,7 +176,7 @@ def _aliased(rng: np.random.Generator, site: Site, target: float, families: Sequ
         for true, other in ((i, j), (j, i)):
             active = _scaled(site.bench, pool[true], target)
             if active:
-                return Choice("alias", target, (active,), alias=(pool[other].name, similar))
+                return Choice((active,), alias=(pool[other].name, similar))
     raise InputError(
         "withheld case", f"an effect of lambda {target:g}", "none", "Ask for less, or more links"
     )

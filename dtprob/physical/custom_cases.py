@@ -6,19 +6,19 @@ that code. The campaigns' levels, exponents and errors are told to nobody.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
-from dtprob.files import atomic_write
+from dtprob.files import atomic_write, write_text
 from dtprob.physical import custom_fading as fading
 from dtprob.physical import custom_path_loss as path_loss
-from dtprob.physical.fault_cases import Families, Setup, Study, generate, left_out, write_text
+from dtprob.physical.fault_cases import Families, Setup, make_case
 from dtprob.physical.gaussian import Vector
-from dtprob.physical.key import checked, write_key
+from dtprob.physical.study import Track, case_end
 
 KINDS: Final = ("null", "listed", "unlisted", "pair")
 FAMILIES: Final = tuple(dict.fromkeys([*path_loss.FAMILIES, *fading.FAMILIES]))
@@ -31,46 +31,9 @@ CONVENTION: Final = (
 _CODE: Final = Path(__file__).parent / "user_code"
 
 
-def generate_cases(
-    out: Path,
-    count: int,
-    seed: int,
-    kinds: Sequence[str] = KINDS,
-    lambda_: float | Sequence[float] = (25.0, 100.0, 400.0),
-    *,
-    families: Sequence[str] = LISTED,
-    resume: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> Path:
-    """Write withheld cases and their key; campaigns with streets and with runs take turns.
-
-    Case i is of kind `kinds[i % len(kinds)]`; its lambda is drawn from those given.
-
-    Args:
-        out: folder; cases go to `cases/NNNN`, `key.json` and `truth/NNNN.json` stay outside of `cases`.
-        count: number of cases.
-        seed: from which everything is drawn.
-        kinds: "null" no fault, "listed" one fault, "unlisted" one whose family the case takes out of the user's effects, or
-            that these never had, "pair" two that can be told apart.
-        lambda_: information that each fault carries alone.
-        families: which faults may occur.
-        resume: keep the cases that are whole.
-        progress: called with the number of cases done and `count`.
-
-    Returns:
-        The key's file.
-
-    Raises:
-        InputError: an unknown kind or family, or a lambda that no fault can reach.
-    """
-    lambdas = checked(kinds, lambda_, families, known_kinds=KINDS, known_families=FAMILIES)
-
-    def make(rng: np.random.Generator, number: int) -> Setup:
-        return _runs(rng, families) if number % 2 else _streets(rng, families)
-
-    generate(out, Study(count, seed, kinds, lambdas), make, resume=resume, progress=progress)
-    plan = {"streets": [path_loss.STREETS, path_loss.ROWS], "runs": [fading.RUNS, fading.STEPS]}
-    return write_key(out, count, seed, track="custom", convention=CONVENTION, plan=plan)
+def _campaign(rng: np.random.Generator, number: int, families: Sequence[str]) -> Setup:
+    """Campaigns with streets and with runs take turns."""
+    return _runs(rng, families) if number % 2 else _streets(rng, families)
 
 
 def _streets(rng: np.random.Generator, families: Sequence[str]) -> Setup:
@@ -126,13 +89,19 @@ name = "{name}:{name}"
 file = "{data}"
 cluster = "{cluster}"
 
-[effects]
-use = "{name}_effects:effects"
-{left_out(excluded)}
-[engine]
-name = "laplace"
-
-[seed]
-value = {seed}
 """
-    write_text(folder / "case.toml", text)
+    end = case_end(excluded, seed, f"{name}_effects:effects")
+    write_text(folder / "case.toml", text + end)
+
+
+TRACK: Final = Track(
+    name="custom",
+    convention=CONVENTION,
+    kinds=KINDS,
+    usual=KINDS,
+    families=FAMILIES,
+    listed=LISTED,
+    plan={"streets": [path_loss.STREETS, path_loss.ROWS], "runs": [fading.RUNS, fading.STEPS]},
+    campaign=_campaign,
+    case=make_case,
+)

@@ -14,7 +14,7 @@ from typing import Final
 
 import numpy as np
 
-from dtprob.files import atomic_write
+from dtprob.files import write_text
 from dtprob.physical.bench import varied
 from dtprob.physical.campaign import describe, trace_nominal
 from dtprob.physical.case_files import write_case
@@ -99,8 +99,7 @@ def generate(folder: Path) -> None:
         "materials": describe(materials),
         "scene": world.scene,
     }
-    with atomic_write(folder / "truth.json") as temporary:
-        temporary.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    write_text(folder / "truth.json", json.dumps(record, indent=1) + "\n")
 
 
 if __name__ == "__main__":

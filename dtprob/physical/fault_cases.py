@@ -1,22 +1,18 @@
-"""What tracks of faulty Gaussian measurements share: which faults a case has, and how cases and records are written."""
+"""What tracks of faulty Gaussian measurements share: which faults a case has, and how it is written."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from dtprob.errors import InputError
-from dtprob.files import atomic_write
 from dtprob.physical.gaussian import Bench, Fault, Sized, Vector, measure, sized, visible
+from dtprob.physical.study import Order
 
 KINDS: Final = ("null", "listed", "unlisted", "pair", "triple")
-SHARED: Final = 8
-"""Cases of one campaign."""
 _TRIES: Final = 60
 _PATIENCE: Final = 8
 """Faults that may be too much like the others before these are drawn anew."""
@@ -114,72 +110,20 @@ class Setup(NamedTuple):
     more: Mapping[str, Any]
 
 
-@dataclass(frozen=True)
-class Study:
-    """Which cases are asked for.
-
-    Attributes:
-        count: how many.
-        seed: from which everything is drawn.
-        kinds: of cases, in turn.
-        lambdas: information of each fault alone, drawn from these.
-    """
-
-    count: int
-    seed: int
-    kinds: Sequence[str]
-    lambdas: Sequence[float]
-
-
-def generate(
-    out: Path,
-    study: Study,
-    make: Callable[[np.random.Generator, int], Setup],
-    *,
-    resume: bool,
-    progress: Callable[[int, int], None] | None,
-) -> None:
-    """Write the cases of a study, each with its record last.
+def make_case(out: Path, order: Order, setup: Setup) -> dict[str, Any]:
+    """Write one case.
 
     Args:
         out: folder of the study.
-        study: what is asked for.
-        make: (rng, number of the campaign) -> the campaign.
-        resume: keep the cases that are whole.
-        progress: called with the number of cases done and of all.
+        order: what is asked for.
+        setup: the campaign.
+
+    Returns:
+        The case's record.
     """
-    for index in range(study.count):
-        name, draws = f"{index:04d}", (study.seed, index)
-        if not (resume and (out / "truth" / f"{name}.json").is_file()):
-            number = index // SHARED
-            setup = make(np.random.default_rng([study.seed, number, 0]), number)
-            rng, kind = np.random.default_rng([*draws, 1]), study.kinds[index % len(study.kinds)]
-            target = study.lambdas[int(rng.integers(len(study.lambdas)))]
-            choice, law = choose(rng, kind, setup.bench, target, setup.families), setup.bench.law
-            for one in choice.faults:
-                law = one.fault.change(law, one.size)
-            measured = measure(np.random.default_rng([*draws, 2]), law)
-            setup.write(out / "cases" / name, measured, choice.excluded, index)
-            record = {
-                "name": name,
-                "kind": kind,
-                "lambda": target if choice.faults else 0.0,
-                "effects": [one.record() for one in choice.faults],
-                "excluded": list(choice.excluded),
-                "alias": None,
-                **setup.more,
-            }
-            write_text(out / "truth" / f"{name}.json", json.dumps(record, indent=1))
-        if progress:
-            progress(index + 1, study.count)
-
-
-def left_out(excluded: Sequence[str]) -> str:
-    """The line of a CASE's [effects] that leaves some out; nothing where there are none."""
-    return f"exclude = {json.dumps(list(excluded))}\n" if excluded else ""
-
-
-def write_text(file: Path, text: str) -> None:
-    """Write a text file whole."""
-    with atomic_write(file) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+    choice, law = choose(order.rng, order.kind, setup.bench, order.lambda_, setup.families), setup.bench.law
+    for one in choice.faults:
+        law = one.fault.change(law, one.size)
+    measured = measure(np.random.default_rng([order.seed, order.index, 2]), law)
+    setup.write(out / "cases" / order.name, measured, choice.excluded, order.index)
+    return order.record([one.record() for one in choice.faults], choice.excluded, **setup.more)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -12,11 +12,15 @@ from jaxtyping import Bool, Complex, Float, Int
 from dtprob.errors import InputError, unknown_name
 from dtprob.physical.rays import Rays, reflections
 from dtprob.physical.world import Material, World, rotation
+from dtprob.raytracing.candidates import CandidateCount, in_groups, large_table
 from dtprob.raytracing.sionna_patch import repaired_sionna
 from dtprob.raytracing.trace import load_scene
 
 SEED: Final = 1
 """Of the solver's rays; path sets of rich scenes may depend on it."""
+
+MAX_PATHS: Final = 1_000_000
+"""Room for the solver's candidate paths per call."""
 
 SAME: Final = 1e-4
 """Two paths on the same objects whose unfolded ends lie closer than this, in m, are one."""
@@ -31,13 +35,13 @@ class _Shape(NamedTuple):
 
 
 class _Found(NamedTuple):
-    """What the solver found, for every pair of its transmitters and receivers."""
+    """What the solver found, padded to the largest number of paths of a link."""
 
-    gain: Complex[np.ndarray, "rx tx path"]
-    mask: Bool[np.ndarray, "rx tx path"]
-    objects: Int[np.ndarray, "depth rx tx path"]
-    primitives: Int[np.ndarray, "depth rx tx path"]
-    steps: Bool[np.ndarray, "depth rx tx path"]
+    gain: Complex[np.ndarray, "link path"]
+    mask: Bool[np.ndarray, "link path"]
+    objects: Int[np.ndarray, "link path depth"]
+    primitives: Int[np.ndarray, "link path depth"]
+    steps: Bool[np.ndarray, "link path depth"]
 
 
 def trace(world: World) -> Rays:
@@ -46,24 +50,19 @@ def trace(world: World) -> Rays:
     Paths and their polarized gains come from Sionna RT (with its complex square root repaired); lengths,
     directions and mirrors are recomputed in double precision from the meshes.
 
+    Warns where the solver dropped candidates of a link.
+
     Raises:
         InputError: the scene, an object or a material does not exist, or no ray tracer can run here.
     """
     scene, shapes = _build(world)
-    tx, tx_index = np.unique(world.tx_position, axis=0, return_inverse=True)
-    rx, rx_index = np.unique(world.rx_position, axis=0, return_inverse=True)
-    found = _solve(scene, world, tx, rx)
-    pick = (rx_index.reshape(-1), tx_index.reshape(-1))
-    mask, gain = found.mask[pick], found.gain[pick]
-    steps, objects, primitives = (
-        np.moveaxis(array, 0, -1)[pick] for array in (found.steps, found.objects, found.primitives)
-    )
-    steps &= mask[..., None]
-    mirror, shift, meets = _isometries(shapes, steps, objects, primitives)
+    found = _links(scene, world)
+    mask, steps = found.mask, found.steps
+    mirror, shift, meets = _isometries(shapes, steps, found.objects, found.primitives)
     unfolded = np.einsum("lpij,lj->lpi", mirror, world.rx_position) + shift - world.tx_position[:, None]
     names = tuple(sorted(shape.name for shape in shapes.values()))
     mask = _single(mask, unfolded, meets)
-    rays = Rays(np.where(mask, gain, 0)[:, None], unfolded[:, None], mirror, mask, meets, names)
+    rays = Rays(np.where(mask, found.gain, 0)[:, None], unfolded[:, None], mirror, mask, meets, names)
     return _ordered(rays, steps.sum(axis=-1))
 
 
@@ -181,37 +180,83 @@ def _place(world: World, scene: Any) -> None:
         one.position = one.position + mi.Point3f(*map(float, vector))
 
 
-def _solve(scene: Any, world: World, tx: Float[np.ndarray, "tx 3"], rx: Float[np.ndarray, "rx 3"]) -> _Found:
-    import mitsuba as mi  # noqa: PLC0415
+def _links(scene: Any, world: World) -> _Found:
+    """The paths of all links, those of one transmitter after the other."""
+    sources, which = np.unique(world.tx_position, axis=0, return_inverse=True)
+    groups = [
+        (links, found)
+        for number, source in enumerate(sources)
+        for links, found in in_groups(
+            lambda some, source=source: _solve(scene, world, source, world.rx_position[some]),
+            np.flatnonzero(which.reshape(-1) == number),
+            depth=world.max_depth,
+            samples=world.rays,
+            max_paths=MAX_PATHS,
+        )
+    ]
+    paths = max(found.mask.shape[1] for _, found in groups)
+    depth = max(found.steps.shape[2] for _, found in groups)
+    order = np.argsort(np.concatenate([links for links, _ in groups]))
+
+    def joined(parts: Sequence[np.ndarray]) -> np.ndarray:
+        size = (paths, depth)
+        wide = [
+            np.pad(
+                part,
+                [(0, 0), *((0, wanted - had) for wanted, had in zip(size, part.shape[1:], strict=False))],
+            )
+            for part in parts
+        ]
+        return np.concatenate(wide)[order]
+
+    return _Found(*(joined(parts) for parts in zip(*(found for _, found in groups), strict=True)))
+
+
+def _solve(
+    scene: Any, world: World, source: Float[np.ndarray, "3"], targets: Float[np.ndarray, "link 3"]
+) -> tuple[_Found, int]:
+    """Paths from a transmitter to some receivers, and how many candidates the solver had for them."""
     from sionna import rt  # noqa: PLC0415
 
-    for side in ("tx_array", "rx_array"):
-        setattr(scene, side, rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V"))
-    yaw, pitch, roll = world.rx_turn
-    for number, point in enumerate(tx):
-        scene.add(
-            rt.Transmitter(
-                f"tx-{number}", mi.Point3f(*point.tolist()), orientation=mi.Point3f(*world.tx_turn)
-            )
-        )
-    for number, point in enumerate(rx):
-        turn = mi.Point3f(yaw, pitch, roll + world.rx_slant)
-        scene.add(rt.Receiver(f"rx-{number}", mi.Point3f(*point.tolist()), orientation=turn))
-    with repaired_sionna():
-        paths = rt.PathSolver(deterministic=True)(
+    places, which = np.unique(targets, axis=0, return_inverse=True)
+    _stand(scene, world, source, places)
+    solver = rt.PathSolver(deterministic=True)
+    count = CandidateCount(solver)
+    with repaired_sionna(), large_table():
+        paths = solver(
             scene,
             max_depth=world.max_depth,
+            max_num_paths_per_src=MAX_PATHS,
             samples_per_src=world.rays,
             refraction=False,
             seed=SEED,
         )
         real, imaginary = (np.asarray(part, np.float64) for part in paths.a)
-    gain = (real + 1j * imaginary)[:, 0, :, 0]
-    mask = np.asarray(paths.valid, bool)
+    pick = which.reshape(-1)
+    mask = np.asarray(paths.valid, bool)[pick, 0]
     objects, primitives, kinds = (
-        np.asarray(a, np.int64) for a in (paths.objects, paths.primitives, paths.interactions)
+        np.moveaxis(np.asarray(part, np.int64)[:, pick, 0], 0, -1)
+        for part in (paths.objects, paths.primitives, paths.interactions)
     )
-    return _Found(gain, mask, objects, primitives, kinds != 0)
+    gain = (real + 1j * imaginary)[pick, 0, 0, 0]
+    return _Found(gain, mask, objects, primitives, (kinds != 0) & mask[..., None]), count.found
+
+
+def _stand(
+    scene: Any, world: World, source: Float[np.ndarray, "3"], places: Float[np.ndarray, "place 3"]
+) -> None:
+    """Put one transmitter and some receivers into the scene, in place of those that were there."""
+    import mitsuba as mi  # noqa: PLC0415
+    from sionna import rt  # noqa: PLC0415
+
+    scene.remove([*scene.transmitters, *scene.receivers])
+    for side in ("tx_array", "rx_array"):
+        setattr(scene, side, rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V"))
+    yaw, pitch, roll = world.rx_turn
+    scene.add(rt.Transmitter("tx", mi.Point3f(*source.tolist()), orientation=mi.Point3f(*world.tx_turn)))
+    turn = mi.Point3f(yaw, pitch, roll + world.rx_slant)
+    for number, point in enumerate(places):
+        scene.add(rt.Receiver(f"rx-{number}", mi.Point3f(*point.tolist()), orientation=turn))
 
 
 def _isometries(

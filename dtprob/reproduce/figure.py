@@ -10,7 +10,7 @@ from typing import Any, final
 import numpy as np
 from jaxtyping import Float
 
-from dtprob.files import atomic_write
+from dtprob.files import atomic_write, write_text
 
 
 @final
@@ -124,8 +124,7 @@ def write(figure: Figure, out: Path, *, seed: int, command: str, seconds: float)
     """
     files = out / f"{figure.figure}.json", out / f"{figure.figure}.png"
     content = figure.to_dict(seed=seed, command=command, seconds=seconds)
-    with atomic_write(files[0]) as path:
-        path.write_text(json.dumps(content, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    write_text(files[0], json.dumps(content, indent=1, allow_nan=False) + "\n")
     with atomic_write(files[1]) as path:
         draw(figure).savefig(path, dpi=150, facecolor="white")
     return files

@@ -9,7 +9,7 @@ import pytest
 
 from dtprob.errors import InputError
 from dtprob.physical.campaign import Plan, Site, make_site
-from dtprob.physical.cases import generate_cases
+from dtprob.physical.cases import TRACK, track
 from dtprob.physical.choose import APART, FOREIGN, LISTED, choose, correlation
 from dtprob.physical.draws import FAMILIES
 from dtprob.physical.front_end import carrier_phase, gain_offset
@@ -93,7 +93,7 @@ def test_what_cannot_be_told_says_so(site):
 )
 def test_wrong_requests_are_refused(arguments, text, tmp_path):
     with pytest.raises(InputError, match=text):
-        generate_cases(tmp_path, 1, 0, **arguments)
+        TRACK.generate(tmp_path, 1, 0, **arguments)
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -103,14 +103,13 @@ def content(folder: Path) -> dict[str, bytes]:
 @pytest.mark.libllvm
 def test_the_same_seed_makes_the_same_bytes_and_resumes(tmp_path):
     def make(name: str, **changes):
-        return generate_cases(
+        return track(PLAN).generate(
             tmp_path / name,
             4,
             5,
             ("null", "listed", "pair", "unlisted"),
             60.0,
             families=FAST,
-            plan=PLAN,
             **changes,
         )
 

@@ -12,7 +12,7 @@ from dtprob.case import load_case
 from dtprob.errors import InputError
 from dtprob.physical import custom_fading as fading
 from dtprob.physical import custom_path_loss as path_loss
-from dtprob.physical.custom_cases import FAMILIES, FOREIGN, LISTED, generate_cases
+from dtprob.physical.custom_cases import FAMILIES, FOREIGN, LISTED, TRACK
 from dtprob.physical.gaussian import information, visible
 from dtprob.usercode import load_object
 from dtprob.workflow import prepare
@@ -44,7 +44,7 @@ def test_sound_laws_are_what_the_twins_can_fit():
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder = tmp_path_factory.mktemp("custom")
-    generate_cases(folder, 9, 3, ("null",), 100.0)
+    TRACK.generate(folder, 9, 3, ("null",), 100.0)
     return folder
 
 
@@ -105,7 +105,7 @@ def test_cases_prepare_with_their_effects(folder):
 
 
 def test_the_same_bytes_again(folder, tmp_path):
-    generate_cases(tmp_path, 1, 3, ("null",), 100.0)
+    TRACK.generate(tmp_path, 1, 3, ("null",), 100.0)
     files = sorted(path.relative_to(tmp_path) for path in (tmp_path / "cases").rglob("*.*"))
     assert len(files) == 4
     assert all((tmp_path / file).read_bytes() == (folder / file).read_bytes() for file in files)
@@ -114,7 +114,7 @@ def test_the_same_bytes_again(folder, tmp_path):
 def test_wrong_requests(tmp_path):
     assert set(LISTED) | set(FOREIGN) == set(FAMILIES)
     with pytest.raises(InputError, match="families"):
-        generate_cases(tmp_path, 1, 0, families=("weather",))
+        TRACK.generate(tmp_path, 1, 0, families=("weather",))
     for track, made in ((path_loss, STREETS), (fading, RUNS)):
         with pytest.raises(InputError, match="family of faults"):
             track.draw(np.random.default_rng(0), "weather", made)

@@ -10,7 +10,7 @@ from dtprob.data import read
 from dtprob.errors import InputError
 from dtprob.physical.fault_cases import Families, choose
 from dtprob.physical.gaussian import Bench, Law, information, louder, measure, shifted, sized, visible
-from dtprob.physical.labels_cases import generate_cases
+from dtprob.physical.labels_cases import TRACK
 from dtprob.physical.labels_faults import FAMILIES, FOREIGN, LISTED, draw
 from dtprob.physical.labels_survey import BLOCKS, EAST, NORTH, ROWS, make_survey
 
@@ -110,7 +110,7 @@ def test_several_faults_can_be_told_apart():
 
 def test_cases(tmp_path):
     for name in ("first", "second"):
-        generate_cases(tmp_path / name, 4, 3, ("null", "listed", "unlisted", "pair"), 100.0)
+        TRACK.generate(tmp_path / name, 4, 3, ("null", "listed", "unlisted", "pair"), 100.0)
     files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*.*"))
     assert [file.read_bytes() for file in (tmp_path / "first" / f for f in files)] == [
         file.read_bytes() for file in (tmp_path / "second" / f for f in files)
@@ -130,6 +130,6 @@ def test_cases(tmp_path):
 def test_wrong_requests(tmp_path):
     assert set(LISTED) | set(FOREIGN) == set(FAMILIES)
     with pytest.raises(InputError, match="kinds"):
-        generate_cases(tmp_path, 1, 0, kinds=("alias",))
+        TRACK.generate(tmp_path, 1, 0, kinds=("alias",))
     with pytest.raises(InputError, match="family of faults"):
         draw(np.random.default_rng(0), "weather", SURVEY)

@@ -8,7 +8,7 @@ import pytest
 from dtprob.case import load_case
 from dtprob.data import read
 from dtprob.errors import InputError
-from dtprob.physical.multi_access.cases import generate_cases
+from dtprob.physical.multi_access.cases import TRACK
 from dtprob.physical.multi_access.fault import Past, subsets
 from dtprob.physical.multi_access.faults import FAMILIES, FOREIGN, LISTED, draw
 from dtprob.physical.multi_access.log import record, sound_acks
@@ -80,7 +80,7 @@ def test_an_outage_is_remembered():
 
 def test_cases(tmp_path):
     for name in ("first", "second"):
-        generate_cases(tmp_path / name, 4, 3, lambda_=100.0)
+        TRACK.generate(tmp_path / name, 4, 3, lambda_=100.0)
     files = sorted(path.relative_to(tmp_path / "first") for path in (tmp_path / "first").rglob("*.*"))
     assert [file.read_bytes() for file in (tmp_path / "first" / f for f in files)] == [
         file.read_bytes() for file in (tmp_path / "second" / f for f in files)
@@ -103,6 +103,6 @@ def test_cases(tmp_path):
 def test_wrong_requests(tmp_path):
     assert set(LISTED) | set(FOREIGN) == set(FAMILIES)
     with pytest.raises(InputError, match="kinds"):
-        generate_cases(tmp_path, 1, 0, kinds=("triple",))
+        TRACK.generate(tmp_path, 1, 0, kinds=("triple",))
     with pytest.raises(InputError, match="family of faults"):
         draw(np.random.default_rng(0), "weather", NETWORK)
