@@ -1,7 +1,7 @@
 """The part of tracing that speaks with sionna-rt: scene in, plain NumPy arrays out."""
 
 import hashlib
-from collections.abc import Callable, Generator
+from collections.abc import Generator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
@@ -9,10 +9,8 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from dtprob.raytracing.candidates import CandidateCount, large_table
 from dtprob.raytracing.sionna_patch import repaired_sionna
-
-_LANES: Final = 30_000_000
-"""Rays times depth times targets that one call of the solver may hold, about 1 GB."""
 
 
 @dataclass(frozen=True)
@@ -33,11 +31,6 @@ class Settings:
     seed: int
     max_paths: int
 
-    @property
-    def targets_at_once(self) -> int:
-        """How many targets one call may have."""
-        return max(1, _LANES // (max(self.max_depth, 1) * self.samples))
-
 
 class Traced(NamedTuple):
     """Paths from one source, as the solver found them; `target` says where each ends."""
@@ -47,7 +40,6 @@ class Traced(NamedTuple):
     object: Int[np.ndarray, "path depth"]
     primitive: Int[np.ndarray, "path depth"]
     vertex: Float[np.ndarray, "path depth 3"]
-    truncated: bool
 
 
 class Objects(NamedTuple):
@@ -121,16 +113,16 @@ def solve(
     source: Float[np.ndarray, "3"],
     targets: Float[np.ndarray, "target 3"],
     settings: Settings,
-) -> Traced:
-    """Find the paths from one source to some targets, in the solver's own order.
+) -> tuple[Traced, int]:
+    """Find the paths from one source to some targets, in the solver's own order; and say how many candidates it had.
 
     Antennas are isotropic and doubly polarised here, so that no path is lost to a null of a pattern.
     """
     from sionna import rt  # noqa: PLC0415
 
     solver = rt.PathSolver(deterministic=True)
-    count = _CandidateCount(solver)
-    with _only_these_devices(scene, source, targets), repaired_sionna():
+    count = CandidateCount(solver)
+    with _only_these_devices(scene, source, targets), repaired_sionna(), large_table():
         paths = solver(
             scene,
             max_depth=settings.max_depth,
@@ -141,26 +133,7 @@ def solve(
             diffraction=False,
             seed=settings.seed,
         )
-        return _flatten(paths, truncated=count.found >= settings.max_paths - 1)
-
-
-class _CandidateCount:
-    """How many candidates the solver found, which `Paths` no longer tells."""
-
-    def __init__(self, solver: Any) -> None:
-        self.found = 0
-        self._generate: Callable[..., Any] = getattr(solver, "_candidate_generator", _no_generator)
-        if self._generate is not _no_generator:
-            solver._candidate_generator = self  # noqa: SLF001 (no public way to see that candidates were dropped)
-
-    def __call__(self, **arguments: Any) -> Any:
-        buffer = self._generate(**arguments)
-        self.found = int(np.asarray(buffer.paths_counter).reshape(-1)[0])
-        return buffer
-
-
-def _no_generator(**_: Any) -> None:
-    """Stands for the generator of a solver that keeps it elsewhere."""
+        return _flatten(paths), count.found
 
 
 @contextmanager
@@ -195,7 +168,7 @@ def _remove_devices(scene: Any) -> None:
     scene.remove([*scene.transmitters, *scene.receivers])
 
 
-def _flatten(paths: Any, *, truncated: bool) -> Traced:
+def _flatten(paths: Any) -> Traced:
     """List the valid paths of all targets one after another."""
     valid = np.asarray(paths.valid)[:, 0]
     target, slot = np.nonzero(valid)
@@ -210,5 +183,4 @@ def _flatten(paths: Any, *, truncated: bool) -> Traced:
         chosen["objects"].astype(np.int64),
         chosen["primitives"].astype(np.int64),
         chosen["vertices"].astype(np.float64),
-        truncated,
     )

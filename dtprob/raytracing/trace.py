@@ -1,7 +1,6 @@
 """Trace the paths of many links through a scene, once, into a `PathSet`."""
 
 import os
-import warnings
 from collections.abc import Generator
 from pathlib import Path
 from types import ModuleType
@@ -12,6 +11,7 @@ from jaxtyping import Float, Int
 
 from dtprob.errors import InputError, unknown_name
 from dtprob.raytracing.assemble import Antenna, Flat, assemble
+from dtprob.raytracing.candidates import in_groups
 from dtprob.raytracing.inside import enclosing_objects
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.sionna import sionna_rt
@@ -124,7 +124,7 @@ def trace(
     """Find the paths of each link and recompute their geometry in double precision.
 
     Antennas have one element; arrays enter later, through `field.steering`. Only the pairs asked for are
-    traced, and which paths are found does not depend on antennas. Warns where the solver dropped candidates.
+    traced, and which paths are found does not depend on antennas. Warns where the solver dropped candidates of a link.
 
     Args:
         scene: from `load_scene` or `floorplan_scene`; left as it was.
@@ -142,7 +142,7 @@ def trace(
         rx_orientation: likewise.
         samples: rays shot from each source; more of them find small or far surfaces.
         seed: of the solver; the same seed finds the same paths.
-        max_paths: room for candidates per call of the solver.
+        max_paths: room for candidates per call of the solver; links are traced in smaller groups if need be.
         frequency: carrier in Hz; that of the scene, known in single precision only, when None.
         allow_empty: whether a link may have no path.
 
@@ -176,25 +176,27 @@ def _trace_links(
     turned = len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
     source, target = (rx, tx) if turned else (tx, rx)
     found = [
-        (links, solve(scene, place, target[links], settings))
-        for place, links in _groups(source, settings.targets_at_once)
+        group
+        for place, links in _groups(source)
+        for group in in_groups(
+            lambda some, place=place: solve(scene, place, target[some], settings),
+            links,
+            depth=settings.max_depth,
+            samples=settings.samples,
+            max_paths=settings.max_paths,
+        )
     ]
-    if any(traced.truncated for _, traced in found):
-        text = f"the solver had room for {settings.max_paths} candidate paths and dropped the others"
-        warnings.warn(f"{text}; raise max_paths.", RuntimeWarning, stacklevel=3)
     flat = _join(found, settings.max_depth)
     return flat.turned() if turned else flat
 
 
 def _groups(
-    source: Float[np.ndarray, "link 3"], size: int
+    source: Float[np.ndarray, "link 3"],
 ) -> Generator[tuple[Float[np.ndarray, "3"], Int[np.ndarray, " group"]]]:
-    """Each distinct source with its links, `size` links at most at a time."""
+    """Each distinct source with its links."""
     places, which = np.unique(source, axis=0, return_inverse=True)
     for number, place in enumerate(places):
-        links = np.flatnonzero(which.reshape(-1) == number)
-        for start in range(0, len(links), size):
-            yield place, links[start : start + size]
+        yield place, np.flatnonzero(which.reshape(-1) == number)
 
 
 def _join(found: list[tuple[Int[np.ndarray, " group"], Traced]], max_depth: int) -> Flat:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dtprob.errors import InputError
+from dtprob.physical import tracing
 from dtprob.physical.channel import Sounding, subcarriers, synthesise
 from dtprob.physical.tracing import object_classes, scene_materials, trace
 from dtprob.physical.world import (
@@ -164,3 +165,19 @@ def test_unknown_names_are_refused():
         trace(move_object(street(), "bilding_6", (0, 1, 0)))
     with pytest.raises(InputError, match="glass"):
         trace(dataclasses.replace(street(), materials={"glas": Material(6.0, 0.01)}))
+
+
+def test_many_receivers_at_once_have_the_paths_they_have_alone(monkeypatch):
+    world = dataclasses.replace(street(4), rays=10_000)
+    together = trace(world)
+    monkeypatch.setattr(tracing, "MAX_PATHS", 100)  # no room for them all: they are traced group by group
+    grouped = trace(world)
+    np.testing.assert_array_equal(grouped.mask, together.mask)
+    np.testing.assert_allclose(grouped.gain, together.gain, rtol=1e-6)
+    np.testing.assert_array_equal(grouped.unfolded, together.unfolded)
+
+
+def test_a_receiver_with_too_many_candidates_is_told(monkeypatch):
+    monkeypatch.setattr(tracing, "MAX_PATHS", 10)
+    with pytest.warns(RuntimeWarning, match="room for 10 candidate paths"):
+        trace(dataclasses.replace(street(1), rays=10_000))

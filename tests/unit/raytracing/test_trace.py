@@ -181,7 +181,7 @@ def test_the_scene_is_left_as_it_was(rt, street, places):
 def test_dropped_candidates_are_told(street, places):
     tx, rx = links(places, "simple_street_canyon")
     with pytest.warns(RuntimeWarning, match="raise max_paths"):
-        trace(street, tx, rx, samples=10_000, max_paths=20, allow_empty=True)
+        trace(street, tx[:2], rx[:2], samples=10_000, max_paths=20, allow_empty=True)
 
 
 def test_a_link_without_paths(street):
