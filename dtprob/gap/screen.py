@@ -74,7 +74,7 @@ def screen(
     means = [e for e in candidates if e.kind == "mean"]
     fields = [e for e in candidates if e.kind == "variance"]
     around = surroundings(problem, fitted.x)
-    scores = _mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
+    scores = mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
     energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
     tested = field_tests(energy, [e.name for e in fields], len(drawn.projected))
     mean_p, mean_z = _mean_tests(scores, scores.u[None])
@@ -100,7 +100,7 @@ def screen(
 
 
 @dataclass(frozen=True)
-class _Scores:
+class Scores:
     """Adjusted scores of mean effects: u of the data and of the replicates, information, and what was projected away."""
 
     effects: tuple[Effect, ...]
@@ -148,7 +148,15 @@ def _is_one_sided(effect: Effect) -> bool:
     return effect.dimension == 1 and effect.parameters[0].is_one_sided
 
 
-def _mean_scores(problem: Problem, projection: Projection, drawn: Replicates, found: Tangents) -> _Scores:
+def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, found: Tangents) -> Scores:
+    """Scores of mean effects, of the data and of the replicates.
+
+    Args:
+        problem: the model on its data.
+        projection: at the fit.
+        drawn: the data and replicates at the fit.
+        found: the effects' tangents there.
+    """
     adjusted, coefficients = projection.adjust(found.columns)
     information = np.array(jnp.einsum("cmi,cmj->ij", found.columns, adjusted))
     total = np.array(jnp.einsum("cmi,cmi->i", found.columns, found.columns))
@@ -162,7 +170,7 @@ def _mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fo
             u[group] += extra.score(values[extra.site][None])[0]
     u_null = np.concatenate([_replicate_scores(adjusted, found, *portion) for portion in drawn.portions()])
     information = (information + information.T) / 2
-    return _Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
+    return Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
 
 
 def _replicate_scores(
@@ -176,7 +184,7 @@ def _replicate_scores(
     return u
 
 
-def _mean_tests(scores: _Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _mean_tests(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """p-values and z of score vectors u (n, columns) for each effect, (n, effect)."""
     p, z = np.ones((len(u), len(scores.effects))), np.zeros((len(u), len(scores.effects)))
     for k, (effect, group) in enumerate(zip(scores.effects, scores.groups, strict=True)):
@@ -194,7 +202,7 @@ def _mean_tests(scores: _Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]
     return np.maximum(p, 1e-300), z
 
 
-def _absorbed(problem: Problem, fitted: fitting.Fit, scores: _Scores, effect: Effect) -> str | None:
+def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Effect) -> str | None:
     """The nuisance that explains nearly all of an effect's own information."""
     if effect.kind != "mean":
         return None
@@ -214,7 +222,7 @@ def _absorbed(problem: Problem, fitted: fitting.Fit, scores: _Scores, effect: Ef
     return blocks[int(owners[int(np.argmax(share))])].name
 
 
-def _detectable(scores: _Scores, effect: Effect, settings: Settings) -> float:
+def _detectable(scores: Scores, effect: Effect, settings: Settings) -> float:
     if effect.kind != "mean":
         return float("nan")
     k = [e.name for e in scores.effects].index(effect.name)
@@ -224,7 +232,7 @@ def _detectable(scores: _Scores, effect: Effect, settings: Settings) -> float:
     return float(needed / np.sqrt(own)) if own > _NOTHING * scores.total[first] else float("inf")
 
 
-def _correlation(candidates: list[Effect], scores: _Scores) -> np.ndarray:
+def _correlation(candidates: list[Effect], scores: Scores) -> np.ndarray:
     """Largest canonical correlation between the candidates' scores; zero where one has no information."""
     result = np.eye(len(candidates))
     roots: dict[str, tuple[np.ndarray, np.ndarray]] = {}
