@@ -40,8 +40,8 @@ def figure(key: PRNGKeyArray, runs: int, progress: Progress, displacements: Sequ
     notes = (
         *urban.NOTES,
         (
-            "Every measurement has a displacement of its own, in a random direction in space; paths are traced again by"
-            " their images."
+            "Every measurement has a displacement of its own, in a random direction in space, and is traced afresh by"
+            f" Sionna RT, {urban.DISPLACED_RAYS} rays; the twin's paths are those of the place it believes in."
         ),
     )
     return Figure("fig6a", title, (Panel(title, x, ERROR, tuple(series)),), runs, notes)
