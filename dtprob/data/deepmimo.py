@@ -5,13 +5,15 @@ set, `<key>_t<set>_tx<index>_r<set>.npz` or `.mat`, each with one array under it
 
     rx_pos (n, 3), tx_pos (3,) or (1, 3)                m
     power (n, path)                                     dB relative to the power sent
-    phase (n, path)                                     deg, at the carrier
+    phase (n, path)                                     deg, at the carrier; without that of the delay in scenarios
+                                                        converted from Sionna RT, whose `Paths.a` has none
     delay (n, path)                                     s
     aoa_az, aoa_el, aod_az, aod_el (n, path)            deg; `_el` is the angle from the z axis, and angles of arrival
                                                         point to where the wave comes from
     inter, inter_pos                                    not read: gains are taken as given
 
-NaN marks missing paths. Source: documentation and converters of DeepMIMO 4 (github.com/DeepMIMO/DeepMIMO).
+NaN marks missing paths. `rt_params.raytracer_name` says which ray tracer a scenario comes from. Source: documentation
+and converters of DeepMIMO 4 (github.com/DeepMIMO/DeepMIMO).
 """
 
 import json
@@ -40,6 +42,8 @@ MATRICES: Final = (
     "aod_az",
     "aod_el",
 )
+SIONNA: Final = "Sionna Ray Tracing"
+"""The name of the ray tracer whose phases do not hold the delay."""
 _PAIR: Final = re.compile(r"power_(t\d+_tx\d+_r\d+)\.(npz|mat)")
 
 
@@ -70,7 +74,8 @@ def from_dictionary(dataset: Mapping[str, Any]) -> PathSet:
     """The path set of a DeepMIMO 4 dataset of one transmitter: `deepmimo.load(...)`, or a dictionary like it.
 
     Args:
-        dataset: the matrices above by name, and `rt_params` with `frequency` in Hz.
+        dataset: the matrices above by name, and `rt_params` with `frequency` in Hz and, where it is `SIONNA`,
+            `raytracer_name`.
 
     Raises:
         InputError: a matrix is missing or has another shape, or there is no path.
@@ -94,8 +99,12 @@ def from_dictionary(dataset: Mapping[str, Any]) -> PathSet:
             )
     mask = np.all([np.isfinite(value) for value in rows.values()], axis=0)
     rows = {key: np.where(mask, value, 0.0) for key, value in rows.items()}
+    frequency = float(np.asarray(dataset["rt_params"]["frequency"]).reshape(-1)[0])
+    phase = np.deg2rad(rows["phase"])
+    if dataset["rt_params"].get("raytracer_name") == SIONNA:
+        phase = phase - 2 * np.pi * np.mod(frequency * rows["delay"], 1.0)
     imported = ImportedPaths(
-        coefficient=10 ** (rows["power"] / 20) * np.exp(1j * np.deg2rad(rows["phase"])),
+        coefficient=10 ** (rows["power"] / 20) * np.exp(1j * phase),
         delay=rows["delay"],
         departure=unit_vector(rows["aod_el"], rows["aod_az"]),
         arrival=-unit_vector(rows["aoa_el"], rows["aoa_az"]),
@@ -103,7 +112,6 @@ def from_dictionary(dataset: Mapping[str, Any]) -> PathSet:
         rx_position=rx,
         tx_position=np.broadcast_to(tx, rx.shape),
     )
-    frequency = float(np.asarray(dataset["rt_params"]["frequency"]).reshape(-1)[0])
     return path_set(imported, frequency, (("solver", "DeepMIMO 4"),))
 
 
@@ -127,8 +135,8 @@ def _matrix(file: Path, arrays: Mapping[str, np.ndarray], key: str) -> np.ndarra
 
 def _parameters(file: Path) -> dict[str, Any]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
-        return {"frequency": float(content["rt_params"]["frequency"])}
+        content = json.loads(file.read_text(encoding="utf-8"))["rt_params"]
+        return {"frequency": float(content["frequency"]), "raytracer_name": content.get("raytracer_name")}
     except (ValueError, KeyError, TypeError) as error:
         expected = "JSON with rt_params.frequency in Hz"
         raise InputError(file.name, expected, str(error), "Export the scenario again") from error

@@ -1,6 +1,7 @@
 """Paths of other ray tracers: files written as their formats are described, read back as path sets."""
 
 import json
+from pathlib import Path
 
 import jax.numpy as jnp
 import numpy as np
@@ -120,6 +121,21 @@ def write_scenario(folder, pair, kind):
 def test_a_deepmimo_scenario_gives_its_channel(tmp_path, kind):
     write_scenario(tmp_path, "t001_tx000_r002", kind)
     check(read_scenario(tmp_path))
+
+
+def test_a_scenario_that_deepmimo_wrote_gives_sionnas_channel():
+    """Converted by DeepMIMO 4.0.5 from sionna-rt 2.2.0, three links of a street at 6 GHz; the channel is sionna-rt's."""
+    paths = read_scenario(Path(__file__).parent / "deepmimo_street")
+    response = frequency_response(paths, jnp.array([0.0, 1e6]))
+    found = synthesize(path_gain(paths, paths.permittivity, paths.conductivity), response)[:, 0, 0, 0]
+    wanted = np.array(
+        [
+            [1.4038732e-04 - 1.2640e-04j, 1.4679557e-05 - 1.8411e-04j],
+            [-1.2576701e-04 - 1.9623e-04j, -2.1274740e-04 - 1.0096e-04j],
+            [9.6132120e-05 - 1.4851e-04j, -6.8521491e-05 - 1.6185e-04j],
+        ]
+    )
+    np.testing.assert_allclose(found, wanted, atol=1e-3 * np.abs(wanted).max())
 
 
 def test_a_deepmimo_dictionary_gives_its_channel():
