@@ -9,17 +9,12 @@ links at once are computed in a process of their own.
 """
 
 import argparse
-import datetime as dt
 import json
-import platform
 import resource
-import shlex
 import subprocess
 import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from dtprob.xla import avoid_miscompilation
@@ -29,6 +24,7 @@ avoid_miscompilation()  # before jax is imported
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from record import record  # noqa: E402
 
 from dtprob.physical.world import SPEED_OF_LIGHT, planar_array  # noqa: E402
 from dtprob.raytracing.calibration import Settings, Statistics, calibrate, project  # noqa: E402
@@ -169,19 +165,10 @@ def memory(links: int) -> dict[str, Any]:
 
 
 def write(seconds: dict[str, float], found: dict[str, Any]) -> None:
-    """Keep the figures with what it takes to repeat them."""
-    result = {
-        "benchmark": f"phase-aware calibration, {STEPS} steps, 50 snapshots, processor time after compiling",
-        "command": shlex.join(["python", "benchmarks/bench_calibration.py", *sys.argv[1:]]),
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "optax")},
-        "seconds": {name: round(value, 3) for name, value in seconds.items()},
-        "memory": found,
-    }
-    file = Path(__file__).parent / "results" / "calibration_of_materials.json"
-    file.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
+    """Keep the figures."""
+    what = f"phase-aware calibration, {STEPS} steps, 50 snapshots, processor time after compiling"
+    figures = {"seconds": {name: round(value, 3) for name, value in seconds.items()}, "memory": found}
+    record("calibration_of_materials", what, ("jax", "optax"), figures)
 
 
 if __name__ == "__main__":

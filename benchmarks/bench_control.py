@@ -11,14 +11,10 @@ slot grows with the number of devices.
 """
 
 import argparse
-import datetime as dt
 import json
-import platform
 import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
-from pathlib import Path
 from typing import ClassVar
 
 import equinox as eqx
@@ -27,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from gymnasium.spaces import Box, Discrete
 from pettingzoo import ParallelEnv
+from record import record
 
 from dtprob.control import COMA, Budget, Environment, FramePolicy, aloha, evaluate, train
 from dtprob.physical.multi_access import Network, PhysicalKernel
@@ -211,17 +208,9 @@ def training(members: int) -> float:
 
 def write(options: argparse.Namespace, figures: dict) -> None:
     """Keep the figures."""
-    content = {
-        "benchmark": "bench_control",
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "settings": {k: v for k, v in vars(options).items() if k != "write"},
-        **figures,
-        "versions": {name: version(name) for name in ("jax", "numpy", "pettingzoo")},
-        "python": platform.python_version(),
-        "processor": platform.machine(),
-    }
-    file = Path(__file__).parent / "results" / "control.json"
-    file.write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
+    settings = {k: v for k, v in vars(options).items() if k != "write"}
+    what = "environment steps per second, and training of policies"
+    record("control", what, ("jax", "numpy", "pettingzoo"), {"settings": settings, **figures})
 
 
 if __name__ == "__main__":

@@ -10,16 +10,11 @@ benchmarks/results/engines.json.
 """
 
 import argparse
-import datetime as dt
 import functools
-import json
-import platform
 import shlex
 import sys
 import time
 from collections.abc import Callable, Mapping
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from dtprob.xla import avoid_miscompilation
@@ -34,12 +29,12 @@ import numpyro.distributions as dist  # noqa: E402
 from numpyro.infer import MCMC  # noqa: E402
 from numpyro.infer import NUTS as RIVAL  # noqa: E402
 from numpyro.infer.reparam import CircularReparam  # noqa: E402
+from record import record, recorded  # noqa: E402
 
 from dtprob.errors import InputError  # noqa: E402
 from dtprob.inference import NUTS, Posterior, RunOptions, resolve, summary  # noqa: E402
 from dtprob.models.complex_normal import ComplexNormal  # noqa: E402
 
-FILE = Path(__file__).parent / "results" / "engines.json"
 LEAN = RunOptions(pointwise=False, deterministics=False)
 CHAINS = {"warmup": 500, "draws": 500, "chains": 2}
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -214,24 +209,19 @@ def errors(posterior: Posterior, reference: Posterior) -> dict[str, Any]:
 
 
 def write(rows: list[dict[str, Any]]) -> None:
-    """Keep the table with what it takes to repeat it; rows that were not run again stay."""
-    old = json.loads(FILE.read_text())["rows"] if FILE.is_file() else []
+    """Keep the table; rows that were not run again stay."""
     done = {(row["model"], row["engine"]) for row in rows}
-    kept = [row for row in old if (row["model"], row["engine"]) not in done]
+    kept = [row for row in recorded("engines").get("rows", []) if (row["model"], row["engine"]) not in done]
     table = [{name: _plain(value) for name, value in row.items()} for row in kept + rows]
     order = [*MODELS]
-    result = {
-        "benchmark": "cost (processor seconds) and error (standard deviations) of the engines",
-        "command": "python benchmarks/bench_engines.py --write",
+    figures = {
         "last_part": shlex.join(sys.argv[1:]),
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "numpyro", "blackjax")},
         "settings": SETTINGS,
         "rows": sorted(table, key=lambda row: order.index(row["model"])),
     }
-    FILE.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {FILE.relative_to(Path.cwd()) if FILE.is_relative_to(Path.cwd()) else FILE}")
+    what = "cost (processor seconds) and error (standard deviations) of the engines"
+    command = "python benchmarks/bench_engines.py --write"
+    record("engines", what, ("jax", "numpyro", "blackjax"), figures, command=command)
 
 
 def _plain(value: Any) -> Any:

@@ -1,36 +1,36 @@
-"""Value and gradient of mean |H - y|^2 in the materials: stored paths in JAX against tracing again.
+"""Value and gradient of mean |H - y|^2 in the materials: stored paths in JAX, in Dr.Jit, and tracing again.
 
-    python benchmarks/bench_field.py [--links 50] [--subcarriers 64] [--samples 100000] [--write]
+    python benchmarks/bench_field.py [--links 50] [--side 8] [--subcarriers 64] [--samples 1000000] [--write]
 
-The rival is Sionna RT: it solves for the paths at every step and differentiates through them with Dr.Jit
-(evaluated loops). Both run in turn in one process, and the figure is the ratio of their median times.
---write keeps it in benchmarks/results/field.json.
+The rivals: Sionna RT, which solves for the paths at every step and differentiates through them with Dr.Jit (evaluated
+loops); and Dr.Jit on the stored paths with the formulas that JAX has, its program built at every step or kept. Channels
+between arrays of side x side antennas enter all of them through the same statistics. All run in turn in one process, and
+the figures are ratios of median times. --write keeps them in benchmarks/results/field.json.
 """
 
 import argparse
-import datetime as dt
-import json
-import platform
-import shlex
 import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from rival_drjit import mean_square, stored_in_drjit
+from record import record
 
-from dtprob.raytracing.field import frequency_response, path_gain, synthesize
+from dtprob.physical.world import SPEED_OF_LIGHT, planar_array
+from dtprob.raytracing.calibration import Statistics, project
+from dtprob.raytracing.candidates import large_table
+from dtprob.raytracing.field import frequency_response, path_gain, steering, synthesize
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.sionna import sionna_rt
 from dtprob.raytracing.sionna_patch import repaired_sionna
 from dtprob.raytracing.trace import load_scene, trace
 
 CARRIER, SPACING, SCALE = 3.5e9, 30e3, 1e10
-REPEATS = {"jax": 50, "sionna_rt": 1}
+REPEATS = {"jax": 50, "drjit": 3, "drjit_frozen": 3, "sionna_rt": 1}
 
 
 def main() -> None:
@@ -39,24 +39,34 @@ def main() -> None:
     scene = load_scene("munich", CARRIER)
     tx, rx = places(options.links)
     paths = trace(scene, tx, rx, samples=options.samples, allow_empty=True)
-    offset = SPACING * (np.arange(options.subcarriers) - options.subcarriers // 2)
-    target = np.asarray(channel(paths, offset, 1.1 * paths.permittivity, 1.2 * paths.conductivity))
-    ours = stored(paths, offset, target)
-    theirs = traced_again(scene, paths, offset, target, options.samples)
-    compare(ours(), theirs())
-    times = in_turns({"jax": ours, "sionna_rt": theirs}, options.rounds)
-    ratio = times["sionna_rt"] / times["jax"]
+    statistics = measured(paths, options.subcarriers, options.side)
+    start = scene_materials(paths)
+    steps = {
+        "jax": stored(paths, statistics, start),
+        "drjit_frozen": stored_in_drjit(paths, statistics, start, SCALE, frozen=True),
+        "drjit": stored_in_drjit(paths, statistics, start, SCALE, frozen=False),
+        "sionna_rt": traced_again(scene, paths, statistics, start, options.samples),
+    }
+    for name, step in steps.items():
+        compare(name, steps["jax"](), step())
+    times = in_turns(steps, options.rounds)
+    ratios = {name: value / times["jax"] for name, value in times.items() if name != "jax"}
     for name, value in times.items():
-        print(f"{name:10s} {1e3 * value:10.3f} ms")
-    print(f"ratio      {ratio:10.0f}")
+        print(f"{name:14s} {1e3 * value:10.3f} ms   {ratios.get(name, 1):8.0f}")
     if options.write:
-        write(options, paths, times, ratio)
+        write(options, paths, times, ratios)
 
 
 def arguments() -> argparse.Namespace:
     """Size of the problem and number of rounds."""
     parser = argparse.ArgumentParser(description="Field of stored paths against tracing again.")
-    for name, default in (("links", 50), ("subcarriers", 64), ("samples", 100_000), ("rounds", 11)):
+    for name, default in (
+        ("links", 50),
+        ("side", 8),
+        ("subcarriers", 64),
+        ("samples", 1_000_000),
+        ("rounds", 11),
+    ):
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--write", action="store_true")
     return parser.parse_args()
@@ -69,36 +79,50 @@ def places(links: int) -> tuple[np.ndarray, np.ndarray]:
     return np.repeat([[8.5, 21.0, 27.0]], links, axis=0), rx
 
 
-def channel(
-    paths: PathSet, offset: np.ndarray, permittivity: jax.Array, conductivity: jax.Array
-) -> jax.Array:
-    """H over links and subcarriers."""
-    gain = path_gain(paths, permittivity, conductivity)
-    return synthesize(gain, frequency_response(paths, jnp.asarray(offset)))[:, 0, 0, 0]
+def measured(paths: PathSet, subcarriers: int, side: int) -> Statistics:
+    """Statistics of noiseless channels of other materials, between square arrays of so many rows."""
+    offset = jnp.asarray(SPACING * (np.arange(subcarriers) - subcarriers // 2))
+    array = jnp.asarray(planar_array(side, side, SPEED_OF_LIGHT / CARRIER / 2))
+    true = synthesize(
+        path_gain(paths, 1.1 * paths.permittivity, 1.2 * paths.conductivity),
+        frequency_response(paths, offset),
+        steering(array, paths.arrival, paths.frequency, -1.0),
+        steering(array, paths.departure, paths.frequency, 1.0),
+    )
+    return project(paths, offset, true, rx_array=array, tx_array=array, powers=False)
 
 
-def stored(paths: PathSet, offset: np.ndarray, target: np.ndarray) -> Callable[[], tuple[float, np.ndarray]]:
+def scene_materials(paths: PathSet) -> np.ndarray:
+    """Permittivity and conductivity of each material, as the scene has them."""
+    first = [int(np.argmax(np.asarray(paths.object_material) == i)) for i in range(paths.n_material)]
+    return np.stack([np.asarray(value)[first] for value in (paths.permittivity, paths.conductivity)])
+
+
+def stored(
+    paths: PathSet, statistics: Statistics, start: np.ndarray
+) -> Callable[[], tuple[float, np.ndarray]]:
     """Value and gradient in permittivity and conductivity of each material, from stored paths."""
 
-    def loss(materials: tuple[jax.Array, jax.Array], paths: PathSet, target: jax.Array) -> jax.Array:
-        each = [value[paths.object_material] for value in materials]
-        return SCALE * jnp.mean(jnp.abs(channel(paths, offset, *each) - target) ** 2)
+    def loss(materials: jax.Array, paths: PathSet, seen: Statistics) -> jax.Array:
+        gain = path_gain(paths, *(value[paths.object_material] for value in materials))
+        fit = jnp.einsum("lp,lpq,lq->", jnp.conj(gain), seen.gram, gain)
+        fit -= 2 * jnp.sum(jnp.conj(gain) * seen.product[:, 0])
+        return SCALE * (jnp.sum(seen.energy) + jnp.real(fit)) / (seen.size * paths.n_link)
 
-    first = [int(np.argmax(np.asarray(paths.object_material) == i)) for i in range(paths.n_material)]
-    materials = (paths.permittivity[np.array(first)], paths.conductivity[np.array(first)])
     function = jax.jit(jax.value_and_grad(loss))
+    materials = jnp.asarray(start)
 
     def step() -> tuple[float, np.ndarray]:
-        value, gradient = jax.block_until_ready(function(materials, paths, jnp.asarray(target)))
+        value, gradient = jax.block_until_ready(function(materials, paths, statistics))
         return float(value), np.asarray(gradient)
 
     return step
 
 
 def traced_again(
-    scene: Any, paths: PathSet, offset: np.ndarray, target: np.ndarray, samples: int
+    scene: Any, paths: PathSet, statistics: Statistics, start: np.ndarray, samples: int
 ) -> Callable[[], tuple[float, np.ndarray]]:
-    """The same, by Sionna's path solver at every step and Dr.Jit's derivatives."""
+    """The same, by Sionna's path solver at every step and Dr.Jit's derivatives; it is spared the channel."""
     import drjit as dr  # noqa: PLC0415
     import mitsuba as mi  # noqa: PLC0415
 
@@ -110,22 +134,22 @@ def traced_again(
     solver = rt.PathSolver(deterministic=True)
     solver.loop_mode = "evaluated"
     materials = [scene.radio_materials[name] for name in paths.material_names]
-    start = [[float(np.asarray(v)[0]) for v in (m.relative_permittivity, m.conductivity)] for m in materials]
-    y = [mi.TensorXf(np.ascontiguousarray(part, np.float32)) for part in (target.real, target.imag)]
+    loss_of = mean_square(paths, statistics, SCALE)
+
+    def solve() -> Any:
+        with repaired_sionna(), large_table():
+            return solver(scene, max_depth=3, samples_per_src=samples, refraction=False, seed=1)
+
+    order = mi.UInt32(slots(solve(), paths))
 
     def step() -> tuple[float, np.ndarray]:
-        values = [[dr.opaque(mi.Float, value) for value in pair] for pair in start]
+        values = [[dr.opaque(mi.Float, float(value)) for value in pair] for pair in start.T]
         for material, (permittivity, conductivity) in zip(materials, values, strict=True):
             dr.enable_grad(permittivity, conductivity)
             material.relative_permittivity, material.conductivity = permittivity, conductivity
-        with repaired_sionna():
-            found = solver(scene, max_depth=3, samples_per_src=samples, refraction=False, seed=1)
-            real, imaginary = found.cfr(mi.Float(offset), normalize_delays=False, out_type="drjit")
-        shape = (len(target), len(offset))
-        error = [
-            dr.reshape(mi.TensorXf, h, shape) - part for h, part in zip((real, imaginary), y, strict=True)
-        ]
-        loss = SCALE * dr.mean(dr.square(error[0]) + dr.square(error[1]))
+        found = solve()
+        gain = mi.Complex2f(*(dr.gather(mi.Float, part.array, order) for part in found.a))
+        loss = loss_of(gain)
         dr.backward(loss)
         slopes = [[float(np.asarray(dr.grad(value))[0]) for value in pair] for pair in values]
         return float(np.asarray(loss).reshape(-1)[0]), np.asarray(slopes).T
@@ -133,10 +157,24 @@ def traced_again(
     return step
 
 
-def compare(ours: tuple[float, np.ndarray], theirs: tuple[float, np.ndarray]) -> None:
-    """Say how far the two answers are apart; the rival keeps phases in single precision."""
+def slots(found: Any, paths: PathSet) -> np.ndarray:
+    """Where the solver keeps each of the stored paths: those of a link have the same order by delay."""
+    valid, delay = np.asarray(found.valid)[:, 0], np.asarray(found.tau)[:, 0]
+    mask = np.asarray(paths.mask)
+    if not np.array_equal(valid.sum(axis=1), mask.sum(axis=1)):
+        sys.exit("the two have not found the same paths")
+    order = np.argsort(np.where(valid, delay, np.inf), axis=1, kind="stable")
+    ours = np.argsort(np.argsort(np.where(mask, paths.delay, np.inf), axis=1, kind="stable"), axis=1)
+    link, path = np.nonzero(mask)
+    return link * valid.shape[1] + order[link, ours[link, path]]
+
+
+def compare(name: str, ours: tuple[float, np.ndarray], theirs: tuple[float, np.ndarray]) -> None:
+    """Say how far two answers are apart; the path solver keeps vertices in single precision."""
     gradient = np.max(np.abs(ours[1] - theirs[1])) / np.max(np.abs(ours[1]))
-    print(f"value {ours[0]:.6g} and {theirs[0]:.6g}; gradients differ by {gradient:.1e} of the largest")
+    print(
+        f"{name}: value {theirs[0]:.6g}, jax {ours[0]:.6g}; gradients differ by {gradient:.1e} of the largest"
+    )
     if abs(ours[0] / theirs[0] - 1) > 0.02 or gradient > 0.05:
         sys.exit("the two do not compute the same thing")
 
@@ -157,24 +195,23 @@ def in_turns(steps: dict[str, Callable[[], Any]], rounds: int) -> dict[str, floa
     return {name: float(np.median(values)) for name, values in times.items()}
 
 
-def write(options: argparse.Namespace, paths: PathSet, times: dict[str, float], ratio: float) -> None:
-    """Keep the figure with what it takes to repeat it."""
-    command = shlex.join(["python", "benchmarks/bench_field.py", *sys.argv[1:]])
-    result = {
-        "benchmark": "value and gradient of mean |H - y|^2 in the materials, munich, depth 3",
-        "command": command,
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "sionna-rt", "drjit")},
-        "size": {"links": options.links, "subcarriers": options.subcarriers, "paths": int(paths.mask.sum())},
+def write(
+    options: argparse.Namespace, paths: PathSet, times: dict[str, float], ratios: dict[str, float]
+) -> None:
+    """Keep the figure."""
+    figures = {
+        "size": {
+            "links": options.links,
+            "antennas": [options.side**2] * 2,
+            "subcarriers": options.subcarriers,
+            "paths": int(paths.mask.sum()),
+        },
         "rays": options.samples,
         "milliseconds": {name: round(1e3 * value, 3) for name, value in times.items()},
-        "ratio": round(ratio),
+        "times_jax": {name: round(value) for name, value in ratios.items()},
     }
-    file = Path(__file__).parent / "results" / "field.json"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
+    what = "value and gradient of mean |H - y|^2 in the materials, munich, depth 3"
+    record("field", what, ("jax", "sionna-rt", "drjit"), figures)
 
 
 if __name__ == "__main__":

@@ -11,12 +11,8 @@ unlabelled samples in files. --write keeps the figures in benchmarks/results.
 """
 
 import argparse
-import datetime as dt
-import json
 import os
-import platform
 import resource
-import shlex
 import sys
 import tempfile
 import time
@@ -33,6 +29,7 @@ avoid_miscompilation()
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
+from record import record, recorded  # noqa: E402
 
 from dtprob.models.prediction_powered.bootstrap import bootstrap  # noqa: E402
 from dtprob.models.prediction_powered.estimate import estimate  # noqa: E402
@@ -40,7 +37,6 @@ from dtprob.models.prediction_powered.sample import Sample  # noqa: E402
 from dtprob.models.prediction_powered.tuning import PUBLISHED  # noqa: E402
 
 FEATURES, FOLDS, RESAMPLES, LEVEL = 5, 5, 1000, 0.9
-RESULTS = Path(__file__).parent / "results"
 SLOW = ("bootstrap mean", "bootstrap ols", "logistic", "cross logistic")
 """Estimators for which the rival is run once and without a run that does not count, as it compiles nothing."""
 
@@ -60,30 +56,30 @@ def main() -> None:
     jax.config.update("jax_enable_x64", True)
     options = arguments()
     if options.memory:
-        report("prediction_powered_memory", memory(options.memory), write=options.write)
+        figures = memory(options.memory)
+        if options.write:
+            what = f"least squares, tuned_cppi, {FOLDS} folds, {options.memory} unlabelled samples in files"
+            record("prediction_powered_memory", what, ("jax", "numpy"), figures)
         return
     rival = ppi_python()
     rows = [row for count in options.unlabelled for row in compared(rival, options, count)]
-    command = shlex.join(["python", "benchmarks/bench_prediction_powered.py", *sys.argv[1:]])
-    result = {
-        "benchmark": f"estimate and 90% interval, {options.labelled} labels, {FEATURES} features",
-        "command": command,
-        "versions": {name: version(name) for name in ("jax", "numpy", "ppi-python")},
+    figures = {
         "labelled": options.labelled,
         "blas_threads": os.environ.get("OMP_NUM_THREADS", "all cores"),
         "unit": "ms; processor: of all threads; clock: of the wall; first_call: of dtprob, by the clock",
-        "rows": rows,
+        "rows": joined(rows),
     }
-    report("prediction_powered", joined(result, RESULTS / "prediction_powered.json"), write=options.write)
+    if options.write:
+        what = f"estimate and 90% interval, {options.labelled} labels, {FEATURES} features"
+        record("prediction_powered", what, ("jax", "numpy", "ppi-python"), figures)
 
 
-def joined(result: dict[str, Any], file: Path) -> dict[str, Any]:
-    """The result with what a file holds of other estimators and numbers of unlabelled samples."""
-    new = {(row["estimator"], row["unlabelled"]) for row in result["rows"]}
-    old = json.loads(file.read_text())["rows"] if file.is_file() else []
+def joined(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows with those that are kept of other estimators and numbers of unlabelled samples."""
+    new = {(row["estimator"], row["unlabelled"]) for row in rows}
+    old = recorded("prediction_powered").get("rows", [])
     kept = [row for row in old if (row["estimator"], row["unlabelled"]) not in new]
-    rows = sorted([*kept, *result["rows"]], key=lambda row: (row["unlabelled"], row["estimator"]))
-    return result | {"rows": rows}
+    return sorted([*kept, *rows], key=lambda row: (row["unlabelled"], row["estimator"]))
 
 
 def arguments() -> argparse.Namespace:
@@ -276,27 +272,10 @@ def memory(count: int) -> dict[str, Any]:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     print(f"{count} unlabelled samples: {seconds:.1f} s, at most {peak / 2**30:.2f} GiB")
     return {
-        "benchmark": f"least squares, tuned_cppi, {FOLDS} folds, {count} unlabelled samples in files",
-        "command": f"python benchmarks/bench_prediction_powered.py --memory {count}",
-        "versions": {name: version(name) for name in ("jax", "numpy")},
         "seconds": round(seconds, 1),
         "peak_gibibyte": round(peak / 2**30, 2),
         "files_gibibyte": round(8 * count * (FEATURES + FOLDS) / 2**30, 2),
     }
-
-
-def report(name: str, result: dict[str, Any], *, write: bool) -> None:
-    """Keep the figures with what it takes to repeat them."""
-    if not write:
-        return
-    where = {
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-    }
-    file = RESULTS / f"{name}.json"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(json.dumps(result | where, indent=1) + "\n")
-    print(f"written to {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
 
 
 if __name__ == "__main__":

@@ -8,20 +8,14 @@ benchmarks/results/wave.json.
 """
 
 import argparse
-import datetime as dt
-import json
-import platform
-import shlex
-import sys
 import time
 from collections.abc import Callable
-from importlib.metadata import version
-from pathlib import Path
 
 import beamz
 import jax
 import jax.numpy as jnp
 import numpy as np
+from record import record
 
 from dtprob.physical.wave import Scene2D
 from dtprob.physical.wave.fdtd import advance, factors, patches, rest
@@ -126,21 +120,14 @@ def in_turns(runs: dict[str, Callable[[], None]], rounds: int) -> dict[str, floa
 
 
 def write(options: argparse.Namespace, rate: dict[str, float]) -> None:
-    """Keep the figures with what it takes to repeat them."""
-    result = {
-        "benchmark": "cell updates of a two-dimensional wave simulation",
-        "command": shlex.join(["python", "benchmarks/bench_wave.py", *sys.argv[1:]]),
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "beamz", "numpy")},
+    """Keep the figures."""
+    figures = {
         "size": {"side": options.side, "steps": options.steps},
         "million_cells_per_processor_second": {name: round(value, 1) for name, value in rate.items()},
         "ratio": {name: round(rate["dtprob"] / rate[name], 2) for name in rate if name != "dtprob"},
     }
-    file = Path(__file__).parent / "results" / "wave.json"
-    file.parent.mkdir(exist_ok=True)
-    file.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
+    what = "cell updates of a two-dimensional wave simulation"
+    record("wave", what, ("jax", "beamz", "numpy"), figures)
 
 
 if __name__ == "__main__":

@@ -9,15 +9,8 @@ in the permittivity, which a single chain does not visit.
 """
 
 import argparse
-import datetime as dt
-import json
-import platform
-import shlex
-import sys
 import time
 from importlib import resources
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from dtprob.xla import avoid_miscompilation
@@ -29,6 +22,7 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 from numpyro import handlers  # noqa: E402
 from numpyro.infer import MCMC, NUTS  # noqa: E402
+from record import record  # noqa: E402
 from scipy import stats  # noqa: E402
 
 from dtprob.case import load_case  # noqa: E402
@@ -112,21 +106,15 @@ def judged(site: str, paths: PathSet, truth: np.ndarray, draws: np.ndarray) -> l
 
 
 def write(rows: list[dict[str, Any]], every: float, diverging: float, seconds: int) -> None:
-    """Keep the table with what it takes to repeat it."""
-    result = {
-        "benchmark": "share of 90% intervals that hold the true material, five materials at once",
-        "command": shlex.join(["python", "benchmarks/material_intervals.py", *sys.argv[1:]]),
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "numpyro")},
+    """Keep the table."""
+    figures = {
         "coverage": round(every, 4),
         "diverging": round(diverging, 5),
         "seconds_processor": seconds,
         "rows": rows,
     }
-    file = Path(__file__).parent / "results" / "material_intervals.json"
-    file.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
+    what = "share of 90% intervals that hold the true material, five materials at once"
+    record("material_intervals", what, ("jax", "numpyro"), figures)
 
 
 if __name__ == "__main__":

@@ -8,13 +8,6 @@ everywhere; after it, what `calibrate` found from one receiver behind a corner.
 """
 
 import argparse
-import datetime as dt
-import json
-import platform
-import shlex
-import sys
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from dtprob.xla import avoid_miscompilation
@@ -24,6 +17,7 @@ avoid_miscompilation()  # before jax is imported
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
+from record import record  # noqa: E402
 
 from dtprob.physical.world import SPEED_OF_LIGHT, planar_array  # noqa: E402
 from dtprob.raytracing.calibration import Settings, Statistics, calibrate, project  # noqa: E402
@@ -130,18 +124,9 @@ def used(
 
 
 def write(rows: list[dict[str, Any]]) -> None:
-    """Keep the table with what it takes to repeat it."""
-    result = {
-        "benchmark": "places among 20 and beams of 4x4 antennas, before and after calibrating the material",
-        "command": shlex.join(["python", "benchmarks/material_uses.py", *sys.argv[1:]]),
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "sionna-rt")},
-        "rows": rows,
-    }
-    file = Path(__file__).parent / "results" / "material_uses.json"
-    file.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {file.relative_to(Path.cwd()) if file.is_relative_to(Path.cwd()) else file}")
+    """Keep the table."""
+    what = "places among 20 and beams of 4x4 antennas, before and after calibrating the material"
+    record("material_uses", what, ("jax", "sionna-rt"), {"rows": rows})
 
 
 if __name__ == "__main__":

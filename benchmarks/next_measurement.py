@@ -13,19 +13,16 @@ Everything is linear and Gaussian, so evidences are exact. --write keeps the fig
 """
 
 import argparse
-import datetime as dt
 import json
-import platform
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
+from record import record
 
 from dtprob.gap.design import Design, Prediction, joined, rank, recommend
 
-FILE = Path(__file__).parent / "results" / "next_measurement.json"
 STREETS, ROWS = 24, 12
 STREET_DB, ERROR_DB = 2.0, 3.0
 NEAR, FAR = (60.0, 220.0), np.linspace(40.0, 1000.0, 13)
@@ -56,11 +53,7 @@ def main() -> None:
     options = parser.parse_args()
     found = [trial(np.random.default_rng([options.seed, k]), k % 2) for k in range(options.trials)]
     table = np.array(found)
-    record = {
-        "study": "a second slope against a loss in proportion to the distance",
-        "command": f"python benchmarks/next_measurement.py --trials {options.trials} --seed {options.seed} --write",
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
+    figures = {
         "trials": options.trials,
         "right": {
             "without new data": float(table[:, 0].mean()),
@@ -72,9 +65,10 @@ def main() -> None:
             "median share of repeating everything": float(np.median(table[:, 3] / table[:, 4])),
         },
     }
-    print(json.dumps(record, indent=1))
+    print(json.dumps(figures, indent=1))
     if options.write:
-        FILE.write_text(json.dumps(record, indent=2) + "\n", encoding="utf-8")
+        what = "a second slope against a loss in proportion to the distance"
+        record("next_measurement", what, ("numpy",), figures)
 
 
 def trial(rng: np.random.Generator, truth: int) -> tuple[float, float, float, float, float]:
