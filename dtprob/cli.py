@@ -133,6 +133,7 @@ def _add_withheld(added: argparse.ArgumentParser) -> None:
     run.add_argument("--workers", type=int, default=1, metavar="N", help="processes at work")
     run.add_argument("--seed", type=int, metavar="S", help="seed, instead of the cases'")
     run.add_argument("--no-code", action="store_true", help="refuse cases that run code of their own")
+    run.add_argument("--rivals", action="store_true", help="let other methods answer too, into rivals.json")
     run.add_argument("--resume", action="store_true", help="keep the answers that are there")
     score = parts.add_parser("score", help="compare answers with their key: score.json, score.html")
     score.add_argument("answers", type=Path, metavar="ANSWERS", help="folder of the answers")

@@ -1,9 +1,12 @@
 """`dtprob diagnose`: from a CASE to a report of why data and twin differ."""
 
-from collections.abc import Mapping
+import json
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
 from xarray import DataTree
 
 from dtprob import __version__
@@ -11,7 +14,12 @@ from dtprob.case import Case
 from dtprob.commands.run import Run, chosen, infer, prepare_case, session
 from dtprob.files import atomic_write, write_text
 from dtprob.gap.diagnose import diagnose
+from dtprob.gap.problem import Problem
+from dtprob.gap.rivals.compete import compete
+from dtprob.gap.settings import Settings
+from dtprob.inference import Posterior
 from dtprob.report import render, to_json
+from dtprob.workflow import Prepared
 
 RESULTS = ("gap.nc", "report.html", "report.json")
 
@@ -30,14 +38,14 @@ def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code:
     """
     with session() as say:
         job = Run(out, resume, not no_code, say)
-        report, gap = _diagnose(chosen(case, engine, seed), job)
+        report, gap = _diagnose(*_ready(chosen(case, engine, seed), job, RESULTS), job)
         write_diagnosis(out, report, gap, title=f"{case.data.file.name} against {case.model.name}")
         say(f"{report['verdict']}: {report.get('summary', '')}".rstrip(": "))
         say(f"done: {out / 'report.html'}")
 
 
 def answer(case: Case, out: Path, *, seed: int | None, no_code: bool) -> None:
-    """Diagnose a case without a word, into report.json alone.
+    """Diagnose a case without a word: timing.json with the seconds that it took, then report.json.
 
     Args:
         case: what to diagnose.
@@ -46,17 +54,40 @@ def answer(case: Case, out: Path, *, seed: int | None, no_code: bool) -> None:
         no_code: refuse a case that runs the user's own code.
     """
     job = Run(out, resume=False, allow_code=not no_code, say=lambda _: None)
-    report, _ = _diagnose(chosen(case, None, seed), job)
+    prepared, reference = _ready(chosen(case, None, seed), job, RESULTS)
+    began = time.perf_counter()
+    report, _ = _diagnose(prepared, reference, job)
+    write_text(out / "timing.json", json.dumps({"seconds": time.perf_counter() - began}))
     write_text(out / "report.json", to_json(report))
 
 
-def _diagnose(case: Case, job: Run) -> tuple[dict[str, Any], DataTree]:
+def answer_of_rivals(case: Case, out: Path, *, seed: int | None, no_code: bool) -> None:
+    """What rivals say about the same case, into rivals.json.
+
+    Args:
+        case: what to diagnose.
+        out: the folder of the answer; what the diagnosis has learned from reference data is taken from there.
+        seed: instead of the case's.
+        no_code: refuse a case that runs the user's own code.
+    """
+    job = Run(out, resume=True, allow_code=not no_code, say=lambda _: None)
+    prepared, reference = _ready(chosen(case, None, seed), job, ())
+    problem = Problem(prepared.model, prepared.data, prepared.effects, prepared.cluster, reference)
+    found = compete(problem, jax.random.fold_in(prepared.key, 1), Settings())
+    write_text(out / "rivals.json", json.dumps(found, indent=1))
+
+
+def _ready(case: Case, job: Run, results: Sequence[str]) -> tuple[Prepared, Posterior | None]:
+    """The case with its data read, and what the twin has learned from reference data."""
+    prepared = prepare_case(case, job, "diagnosis", results)
+    if prepared.reference is None:
+        return prepared, None
+    job.say("learning the twin from the reference data")
+    return prepared, infer(prepared, prepared.reference, job.out / "reference.nc", job)
+
+
+def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tuple[dict[str, Any], DataTree]:
     """The content of report.json and of gap.nc."""
-    prepared = prepare_case(case, job, "diagnosis", RESULTS)
-    reference = None
-    if prepared.reference is not None:
-        job.say("learning the twin from the reference data")
-        reference = infer(prepared, prepared.reference, job.out / "reference.nc", job)
     job.say(f"{len(prepared.effects)} candidate effects")
     diagnosis = diagnose(
         prepared.model,

@@ -7,6 +7,7 @@ import os
 import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -63,7 +64,16 @@ def generate(
         say(f"done: {out / 'cases'}, and the key apart: {file}")
 
 
-def run(cases: Path, out: Path, *, workers: int, seed: int | None, no_code: bool, resume: bool) -> None:
+def run(
+    cases: Path,
+    out: Path,
+    *,
+    workers: int,
+    seed: int | None,
+    no_code: bool,
+    rivals: bool,
+    resume: bool,
+) -> None:
     """Diagnose every CASES/NAME/case.toml into OUT/NAME/report.json; nothing but the cases is read.
 
     Args:
@@ -72,6 +82,7 @@ def run(cases: Path, out: Path, *, workers: int, seed: int | None, no_code: bool
         workers: processes at work.
         seed: instead of the cases' own.
         no_code: refuse cases that run code of their own.
+        rivals: let rivals answer too, into OUT/NAME/rivals.json.
         resume: keep the answers that are there.
 
     Raises:
@@ -84,8 +95,12 @@ def run(cases: Path, out: Path, *, workers: int, seed: int | None, no_code: bool
         raise InputError(
             f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
         )
-    todo = [name for name in found if not (resume and (out / name / "report.json").is_file())]
-    jobs = [(cases, out, names, seed, no_code) for names in _portions(todo)]
+    wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
+    todo = [n for n in found if not resume or any(not (out / n / file).is_file() for file in wanted)]
+    jobs = [
+        _Job(cases, out, names, wanted, seed=seed, no_code=no_code, resume=resume)
+        for names in _portions(todo)
+    ]
     failed: list[str] = []
     with telling() as say:
         say(f"{len(todo)} of {len(found)} cases to diagnose")
@@ -111,28 +126,50 @@ def score(answers: Path, key: Path) -> None:
 
     content = _json(key)
     names = [str(case.get("name")) for case in content.get("cases", [])]
-    reports = {name: _report(answers / name) for name in names if (answers / name).is_dir()}
-    result = scored(content, reports)
+    there = [name for name in names if (answers / name).is_dir()]
+    files = ("report.json", "timing.json", "rivals.json")
+    reports, timings, rivals = ({name: _optional(answers / name / file) for name in there} for file in files)
+    seconds = {name: timing["seconds"] for name, timing in timings.items() if timing}
+    result = scored(content, reports, {name: said for name, said in rivals.items() if said}, seconds)
     write_text(answers / "score.json", json.dumps(result, indent=1, allow_nan=False) + "\n")
     write_text(answers / "score.html", render_score(result))
     for stratum in result["strata"]:
         print(f"{stratum['kind']}, lambda {stratum['lambda']:g}: {stratum['cases']} cases")
         for name, rate in stratum["rates"].items():
-            print(f"  {name}: {rate['count']}/{rate['of']} ({rate['low']:.3f} to {rate['high']:.3f})")
+            theirs = [
+                f"{rival} {said['rates'][name]['count']}/{said['rates'][name]['of']}"
+                for rival, said in stratum["rivals"].items()
+                if name in said["rates"]
+            ]
+            beside = f"; {', '.join(theirs)}" if theirs else ""
+            print(f"  {name}: {rate['count']}/{rate['of']} ({rate['low']:.3f} to {rate['high']:.3f}){beside}")
     print(f"done: {answers / 'score.html'}")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """Cases for one worker, and which files of each are wanted."""
+
+    cases: Path
+    out: Path
+    names: Sequence[str]
+    wanted: Sequence[str]
+    seed: int | None
+    no_code: bool
+    resume: bool
 
 
 def _portions(names: Sequence[str]) -> list[list[str]]:
     return [list(names[i : i + _SHARED]) for i in range(0, len(names), _SHARED)]
 
 
-def _answers(jobs: Sequence[tuple[Any, ...]], workers: int, say: Say) -> Iterator[list[str]]:
+def _answers(jobs: Sequence[_Job], workers: int, say: Say) -> Iterator[list[str]]:
     """The failed names of each portion, as the portions end."""
     if not jobs:
         return
     context = multiprocessing.get_context("spawn")
     with ProcessPoolExecutor(min(workers, len(jobs)), context, max_tasks_per_child=_LIFE) as pool:
-        waiting = [pool.submit(_diagnose_all, *job) for job in jobs]
+        waiting = [pool.submit(_diagnose_all, job) for job in jobs]
         try:
             for ended in as_completed(waiting):
                 yield ended.result()
@@ -144,23 +181,26 @@ def _answers(jobs: Sequence[tuple[Any, ...]], workers: int, say: Say) -> Iterato
             raise
 
 
-def _diagnose_all(cases: Path, out: Path, names: Sequence[str], seed: int | None, no_code: bool) -> list[str]:
+def _diagnose_all(job: _Job) -> list[str]:
     """Diagnose some cases in this process; the names of those that could not be."""
     from dtprob.xla import avoid_miscompilation  # noqa: PLC0415
 
     avoid_miscompilation()
     from dtprob.case import load_case  # noqa: PLC0415  (after the compiler is set right)
-    from dtprob.commands.diagnose import answer  # noqa: PLC0415
+    from dtprob.commands.diagnose import answer, answer_of_rivals  # noqa: PLC0415
     from dtprob.commands.run import configure  # noqa: PLC0415
 
     configure()
     warnings.simplefilter("ignore")  # a report says itself what there is to note
-    failed = []
-    for name in names:
-        folder = out / name
+    answers, failed = {"report.json": answer, "rivals.json": answer_of_rivals}, []
+    for name in job.names:
+        folder = job.out / name
         folder.mkdir(parents=True, exist_ok=True)
         try:
-            answer(load_case(cases / name / "case.toml"), folder, seed=seed, no_code=no_code)
+            case = load_case(job.cases / name / "case.toml")
+            for file in job.wanted:
+                if not (job.resume and (folder / file).is_file()):
+                    answers[file](case, folder, seed=job.seed, no_code=job.no_code)
         except Exception as error:  # noqa: BLE001  (one bad case must not end the others)
             failed.append(name)
             write_text(folder / "error.txt", f"{type(error).__name__}: {error}\n")
@@ -169,8 +209,7 @@ def _diagnose_all(cases: Path, out: Path, names: Sequence[str], seed: int | None
     return failed
 
 
-def _report(folder: Path) -> dict[str, Any] | None:
-    file = folder / "report.json"
+def _optional(file: Path) -> dict[str, Any] | None:
     return _json(file) if file.is_file() else None
 
 

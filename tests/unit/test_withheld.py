@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dtprob.cli import main
+from dtprob.gap.rivals.compete import RIVALS
 from tests.unit.test_cli import CASE, EFFECTS, MODEL
 
 
@@ -39,7 +40,16 @@ def cases(tmp_path_factory):
 @pytest.fixture(scope="module")
 def answered(cases):
     status = main(
-        ["withheld", "run", str(cases / "cases"), "--out", str(cases / "answers"), "--workers", "2"]
+        [
+            "withheld",
+            "run",
+            str(cases / "cases"),
+            "--out",
+            str(cases / "answers"),
+            "--workers",
+            "2",
+            "--rivals",
+        ]
     )
     assert status == 1  # one case cannot be read, which ends no other
     return cases
@@ -51,6 +61,11 @@ def test_answers_are_reports(answered):
         report = json.loads((answered / "answers" / name / "report.json").read_text())
         verdicts[name] = report["verdict"], [cause["effects"] for cause in report["causes"]]
     assert verdicts == {"0000": ("LISTED", [["bias"]]), "0001": ("NO_GAP", [])}
+    for name in ("0000", "0001"):
+        said = json.loads((answered / "answers" / name / "rivals.json").read_text())
+        assert set(said) == set(RIVALS)
+        assert all((one["verdict"] == "NO_GAP") == (name == "0001") for one in said.values())
+        assert json.loads((answered / "answers" / name / "timing.json").read_text())["seconds"] > 0
     assert "line.csv" in (answered / "answers" / "0002" / "error.txt").read_text()
     assert not (answered / "answers" / "0002" / "report.json").exists()
 
@@ -62,6 +77,7 @@ def test_the_score(answered, capsys):
     score = json.loads((answered / "answers" / "score.json").read_text())
     strata = {stratum["kind"]: stratum for stratum in score["strata"]}
     assert strata["null"]["verdicts"] == {"FAILED": 1, "NO_GAP": 1}
+    assert strata["listed"]["rivals"]["forward_bic"]["rates"]["right effect first"]["count"] == 1
     assert (answered / "answers" / "score.html").stat().st_size > 2000
 
 

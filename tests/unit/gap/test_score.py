@@ -4,7 +4,12 @@ import pytest
 from scipy import stats
 
 from dtprob.errors import InputError
-from dtprob.gap.score import Rate, score
+from dtprob.gap.answers import Answer
+from dtprob.gap.rates import Rate
+from dtprob.gap.score import score
+from dtprob.gap.truths import PARAMETERS, SITES
+from dtprob.physical import custom_cases, draws, labels_cases
+from dtprob.physical.multi_access import faults
 from dtprob.report.score_page import render_score
 
 
@@ -86,6 +91,85 @@ def test_the_page_tells_every_case(scored):
     assert "<script" not in page
     assert "http:" not in page
     assert "https:" not in page
+
+
+def answered(track, true, *, named=(), size=None, sites=(), shares=(), fraction=None, kind="listed"):
+    """An answer with sizes, sites and a closed fraction."""
+    size = {"c": {"low": size[0], "high": size[1]}} if size else {}
+    cause = {"effects": list(named), "alias_class": [list(named)], "size": size, "closed_fraction": fraction}
+    said = {
+        "verdict": "LISTED" if named else "UNLISTED",
+        "causes": [cause] if named else [],
+        "unlisted": {"sites": list(sites)},
+        "where": {"sites": [{"site": site} for site in shares]},
+    }
+    return Answer(track, {"kind": kind, "lambda": 100.0, "effects": list(true)}, said, None)
+
+
+def true(name, size=1.0, information=100.0):
+    return {"name": name, "family": name.split("[")[0], "size": size, "lambda": information}
+
+
+def test_sizes_are_compared_where_truth_and_library_speak_of_the_same():
+    wall = [true("wall[river]", 7.6)]
+    assert answered("custom", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == [True]
+    assert answered("custom", wall, named=["wall[river]"], size=(8.0, 9.0)).covered_size() == [False]
+    assert answered("custom", wall, named=["wall[railway]"], size=(7.0, 8.0)).covered_size() == []
+    assert answered("network", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == []
+    bias = [true("regional_bias[x0_low]", 3.0)]  # the key does not tell the sign
+    assert answered("labels", bias, named=["regional_bias[x0_low]"], size=(-3.5, -2.5)).covered_size() == [
+        True
+    ]
+    gain = [true("gain_offset", 20 * 0.1 / 2.302585093)]  # decibels in truth, nepers in the library
+    assert answered("channel", gain, named=["gain_offset"], size=(0.0999, 0.1001)).covered_size() == [True]
+
+
+def test_a_right_answer_can_close_what_estimating_its_parameters_does_not_cost():
+    """One parameter from three quarters of data with lambda 100: 1 - 4 / 3 / 100."""
+    for low, expected in ((0.98, True), (0.99, False)):
+        fraction = {"mean": 0.99, "low": low, "high": 1.0}
+        said = answered("custom", [true("wall")], named=["wall"], size=(0, 1), fraction=fraction)
+        assert said.covered_fraction() == [expected]
+    assert answered("custom", [true("wall")], named=["sector"], fraction=fraction).covered_fraction() == []
+
+
+def test_the_first_site_is_that_of_the_remainder_or_else_of_the_map():
+    gusts = [true("gusts")]
+    shares = ["expected_power", "deviation"]
+    assert answered("custom", gusts, sites=["deviation"], shares=shares).right_site() == [True]
+    assert answered("custom", gusts, shares=shares).right_site() == [False]
+    assert answered("custom", [true("unheard_of")], shares=shares).right_site() == []
+
+
+def test_named_effects_are_counted_one_by_one():
+    said = answered("custom", [true("wall"), true("sector")], named=["wall", "gain_drift", "second_slope"])
+    assert sorted(said.wrong_names()) == [False, True, True]
+
+
+def test_every_family_of_every_track_has_its_sites():
+    families = {
+        "channel": draws.FAMILIES,
+        "network": faults.FAMILIES,
+        "labels": labels_cases.FAMILIES,
+        "custom": custom_cases.FAMILIES,
+    }
+    assert {track: set(known) for track, known in SITES.items()} == {t: set(f) for t, f in families.items()}
+    assert all(set(PARAMETERS[track]) <= set(SITES[track]) for track in SITES)
+
+
+def test_rivals_stand_beside_each_stratum():
+    rivals = {
+        "0001": {"lasso": {**report("NO_GAP"), "seconds": 2.0}},
+        "0003": {"lasso": {**report("LISTED", "doppler"), "seconds": 4.0}},
+    }
+    found = score(KEY, REPORTS, rivals, {"0003": 7.0})
+    strata = {stratum["kind"]: stratum for stratum in found["strata"]}
+    assert strata["null"]["rivals"]["lasso"]["rates"]["alarm"]["of"] == 1
+    assert strata["listed"]["rivals"]["lasso"]["rates"]["right effect first"]["rate"] == 1.0
+    assert strata["listed"]["rivals"]["lasso"]["seconds"]["median"] == 4.0
+    assert strata["listed"]["seconds"]["median"] == 7.0
+    assert strata["unlisted"]["rivals"] == {}
+    assert ">lasso<" in render_score(found)
 
 
 def test_wrong_keys_and_answers():

@@ -1,0 +1,153 @@
+"""The LASSO on residual features: all candidates' tangents at once, few of them with a coefficient.
+
+Source: Tibshirani, J. R. Stat. Soc. B 58 (1996) 267; the whole path by Efron, Hastie, Johnstone & Tibshirani, Ann. Stat. 32
+(2004) 407; the end of it by BIC with the number of coefficients as degrees of freedom, Zou, Hastie & Tibshirani, Ann. Stat.
+35 (2007) 2173.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from dtprob.gap.rivals.claim import Claim
+from dtprob.gap.rivals.look import Look, chance, is_one_sided
+
+_LONGEST = 40
+"""Knots of the path that are looked at."""
+_HIDDEN = 1e-6
+"""Share of a feature's norm that must be left after the nuisances for it to be one."""
+_ROUNDING = 1e-10
+
+
+class Features(NamedTuple):
+    """Residual features of unit norm.
+
+    Attributes:
+        score: inner products with the residual, (1 + replicate, feature), the data first.
+        correlation: of the features.
+        positive: which may only have positive coefficients.
+        owner: index of each feature's effect.
+    """
+
+    score: Float[np.ndarray, "n feature"]
+    correlation: Float[np.ndarray, "feature feature"]
+    positive: Bool[np.ndarray, " feature"]
+    owner: np.ndarray
+
+
+def lasso(seen: Look) -> Claim:
+    """Name the effects with a coefficient where BIC ends the path; rank by coefficients.
+
+    The alarm is the penalty at which the path begins: the largest score of all features.
+
+    Args:
+        seen: the base fit.
+    """
+    features = _features(seen)
+    if not len(features.owner):
+        return Claim(1.0, (), seen.names)
+    largest = np.where(features.positive, features.score, np.abs(features.score)).max(axis=1)
+    score, n = features.score[0], seen.problem.n_observation
+    knots = list(path(score, features.correlation, features.positive))
+    best = min(knots, key=lambda b: _bic(b, score, features.correlation, n))
+    weight = np.zeros(len(seen.effects))
+    np.maximum.at(weight, features.owner, np.abs(best))
+    order = np.lexsort((-seen.gain[0], -weight))
+    ranking = tuple(seen.names[i] for i in order)
+    return Claim(chance(largest), ranking[: int((weight > 0).sum())], ranking)
+
+
+def path(
+    score: Float[np.ndarray, " n"], correlation: Float[np.ndarray, "n n"], positive: Bool[np.ndarray, " n"]
+) -> Iterator[Float[np.ndarray, " n"]]:
+    """The coefficients at the knots of the path of min 1/2 b'Rb - u'b + penalty |b|_1, from none on.
+
+    Args:
+        score: u, inner products of the features with the response.
+        correlation: R, inner products of the features with one another.
+        positive: which coefficients may not be negative.
+    """
+    b, active = np.zeros(len(score)), list[int]()
+    penalty = float(np.where(positive, score, np.abs(score)).max(initial=0.0))
+    yield b
+    if penalty <= 0:
+        return
+    entered = True
+    for _ in range(_LONGEST):
+        c = score - correlation @ b
+        if entered:
+            joins = np.where(positive, c, np.abs(c))
+            joins[active] = -np.inf
+            active.append(int(np.argmax(joins)))
+        part = correlation[np.ix_(active, active)]
+        direction = np.linalg.lstsq(part, np.sign(c[active]), rcond=None)[0]
+        change = correlation[:, active] @ direction
+        step, leaves = _next(
+            c, change, b[active], direction, penalty=penalty, active=active, positive=positive
+        )
+        b = b.copy()
+        b[active] += step * direction
+        penalty -= step
+        entered = leaves is None
+        if leaves is not None:
+            b[active.pop(leaves)] = 0.0
+        yield b
+        if penalty <= _ROUNDING * abs(score).max() or len(active) == len(score) or not active:
+            return
+
+
+def _next(
+    c: np.ndarray,
+    change: np.ndarray,
+    b: np.ndarray,
+    direction: np.ndarray,
+    *,
+    penalty: float,
+    active: list[int],
+    positive: np.ndarray,
+) -> tuple[float, int | None]:
+    """How far the path goes straight on, and which coefficient then becomes zero, if it is not that another joins."""
+    idle = np.ones(len(c), bool)
+    idle[active] = False
+    with np.errstate(divide="ignore", invalid="ignore"):
+        up, down = (penalty - c) / (1 - change), (penalty + c) / (1 + change)
+        zero = -b / direction
+    tiny = _ROUNDING * penalty
+    up = np.where(idle & (up > tiny), up, np.inf)
+    down = np.where(idle & ~positive & (down > tiny), down, np.inf)
+    zero = np.where((zero > tiny) & (b != 0), zero, np.inf)
+    join = min(float(up.min()), float(down.min()), penalty)
+    first = int(np.argmin(zero))
+    return (float(zero[first]), first) if zero[first] < join else (join, None)
+
+
+def _bic(b: np.ndarray, score: np.ndarray, correlation: np.ndarray, n: int) -> float:
+    """The response's noise has unit variance; a constant is left out."""
+    return float(b @ correlation @ b - 2 * score @ b + np.log(n) * np.count_nonzero(b))
+
+
+def _features(seen: Look) -> Features:
+    """Of the effects' parameters, those that the fit does not hide; of a random field its standardised energy."""
+    own = np.diag(seen.scores.information)
+    kept = np.flatnonzero(own > _HIDDEN * np.maximum(seen.scores.total, 1e-300))
+    root = np.sqrt(own[kept])
+    owner = np.concatenate(
+        [np.full(len(g), k) for k, g in enumerate(seen.scores.groups)] or [np.zeros(0, int)]
+    )
+    sided = np.array([is_one_sided(e) for e in seen.scores.effects], bool)
+    energy = seen.energy[:, :, 0]
+    mean, deviation = energy[:, 1:].mean(axis=1), energy[:, 1:].std(axis=1)
+    alive = np.flatnonzero(deviation > 0)
+    z = ((energy[alive] - mean[alive, None]) / deviation[alive, None]).T
+    correlation = np.eye(len(kept) + len(alive))
+    correlation[: len(kept), : len(kept)] = seen.scores.information[np.ix_(kept, kept)] / np.outer(root, root)
+    return Features(
+        score=np.concatenate([seen.u[:, kept] / root, z], axis=1),
+        correlation=correlation,
+        positive=np.concatenate([sided[owner[kept].astype(int)], np.ones(len(alive), bool)]),
+        owner=np.concatenate([owner[kept], len(sided) + alive]).astype(int),
+    )
