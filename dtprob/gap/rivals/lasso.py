@@ -1,8 +1,8 @@
 """The LASSO on residual features: all candidates' tangents at once, few of them with a coefficient.
 
 Source: Tibshirani, J. R. Stat. Soc. B 58 (1996) 267; the whole path by Efron, Hastie, Johnstone & Tibshirani, Ann. Stat. 32
-(2004) 407; the end of it by BIC with the number of coefficients as degrees of freedom, Zou, Hastie & Tibshirani, Ann. Stat.
-35 (2007) 2173.
+(2004) 407. The penalty is chosen by the extended BIC (Chen & Chen, Biometrika 95 (2008) 759) of least squares on what it
+leaves (Meinshausen, Comput. Stat. Data Anal. 52 (2007) 374): with shrunken coefficients far too many are kept.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
+from scipy import special
 
 from dtprob.gap.rivals.claim import Claim
 from dtprob.gap.rivals.look import Look, chance, is_one_sided
@@ -40,7 +41,7 @@ class Features(NamedTuple):
 
 
 def lasso(seen: Look) -> Claim:
-    """Name the effects with a coefficient where BIC ends the path; rank by coefficients.
+    """Name the effects with a coefficient where the extended BIC ends the path; rank by coefficients.
 
     The alarm is the penalty at which the path begins: the largest score of all features.
 
@@ -53,7 +54,7 @@ def lasso(seen: Look) -> Claim:
     largest = np.where(features.positive, features.score, np.abs(features.score)).max(axis=1)
     score, n = features.score[0], seen.problem.n_observation
     knots = list(path(score, features.correlation, features.positive))
-    best = min(knots, key=lambda b: _bic(b, score, features.correlation, n))
+    best = min(knots, key=lambda b: extended_bic(b != 0, score, features.correlation, n))
     weight = np.zeros(len(seen.effects))
     np.maximum.at(weight, features.owner, np.abs(best))
     order = np.lexsort((-seen.gain[0], -weight))
@@ -125,9 +126,24 @@ def _next(
     return (float(zero[first]), first) if zero[first] < join else (join, None)
 
 
-def _bic(b: np.ndarray, score: np.ndarray, correlation: np.ndarray, n: int) -> float:
-    """The response's noise has unit variance; a constant is left out."""
-    return float(b @ correlation @ b - 2 * score @ b + np.log(n) * np.count_nonzero(b))
+def extended_bic(
+    kept: Bool[np.ndarray, " n"],
+    score: Float[np.ndarray, " n"],
+    correlation: Float[np.ndarray, "n n"],
+    observations: int,
+) -> float:
+    """Of least squares on some features, noise of unit variance; a constant is left out.
+
+    Args:
+        kept: the features.
+        score: inner products of all features with the response.
+        correlation: of all features.
+        observations: number of them.
+    """
+    size, total, own = int(kept.sum()), len(kept), score[kept]
+    fitted = np.linalg.lstsq(correlation[np.ix_(kept, kept)], own, rcond=None)[0]
+    sets = special.gammaln(total + 1) - special.gammaln(size + 1) - special.gammaln(total - size + 1)
+    return float(-own @ fitted + size * np.log(observations) + 2 * sets)
 
 
 def _features(seen: Look) -> Features:

@@ -16,7 +16,7 @@ from dtprob.gap.rivals.claim import Claim
 from dtprob.gap.rivals.compete import RIVALS
 from dtprob.gap.rivals.criteria import bic, loo
 from dtprob.gap.rivals.discrepancy import VARIANCES, evidences, inputs
-from dtprob.gap.rivals.lasso import lasso, path
+from dtprob.gap.rivals.lasso import extended_bic, lasso, path
 from dtprob.gap.rivals.look import chance, look
 from dtprob.gap.rivals.stepwise import LOO
 from dtprob.gap.settings import Settings
@@ -139,6 +139,16 @@ def test_every_knot_of_a_path_is_optimal(seed):
         assert np.all(b[positive] >= 0)
 
 
+def test_extended_bic_is_that_of_least_squares():
+    rng = np.random.default_rng(0)
+    matrix, response = rng.normal(size=(30, 5)), rng.normal(size=30)
+    kept = np.array([True, False, True, False, False])
+    found = extended_bic(kept, matrix.T @ response, matrix.T @ matrix, 30)
+    left = response - matrix[:, kept] @ np.linalg.lstsq(matrix[:, kept], response, rcond=None)[0]
+    expected = left @ left - response @ response + 2 * np.log(30) + 2 * np.log(10)  # 10 pairs of five
+    assert found == pytest.approx(expected)
+
+
 def test_nothing_joins_a_path_that_may_not():
     knots = list(path(np.array([-1.0, -2.0]), np.eye(2), np.ones(2, bool)))
     assert len(knots) == 1
@@ -207,7 +217,7 @@ def test_the_lasso_names_a_single_strong_effect_first():
     data = draw("line", shift=0.4 * np.asarray(regressors(n_link=40)) ** 2, x=regressors(n_link=40))
     claim = lasso(seen(data, [bend(), ripple(), jitter()]))
     assert claim.p_value == 0.01
-    assert claim.ranking[0] == "bend"
+    assert claim.effects == ("bend",)
 
 
 def test_a_process_knows_when_none_of_the_candidates_is_like_it():
