@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Final
 
@@ -142,6 +142,16 @@ class Answer:
             return []
         folds, size = Settings().folds, len(self.first.get("size", {}))
         return [closed["low"] <= 1 - size * folds / (folds - 1) / total <= closed["high"]]
+
+    @staticmethod
+    def closes(share: float) -> Callable[[Answer], list[bool]]:
+        """Whether a right answer with an established gap closes a share of it."""
+
+        def test(answer: Answer) -> list[bool]:
+            closed = answer.first.get("closed_fraction") if answer.first else None
+            return [closed["mean"] >= share] if closed and answer.is_right else []
+
+        return test
 
 
 def _families(names: frozenset[str]) -> frozenset[str]:

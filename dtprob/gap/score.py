@@ -9,6 +9,7 @@ from typing import Any, Final
 from dtprob.errors import InputError
 from dtprob.gap.answers import Answer, Report, Truth
 from dtprob.gap.rates import quantiles, rates
+from dtprob.gap.targets import against_targets
 
 type Test = Callable[[Answer], Iterable[bool]]
 
@@ -58,9 +59,9 @@ def score(
         seconds: that the diagnosis took, by the case's name.
 
     Returns:
-        `strata`, per kind and lambda: number of cases, verdicts, rates with intervals, size of the alias class, closed
-        fraction and width of its interval, seconds, and `rivals`, of which each has the same as far as it says it; `cases`,
-        what was said of each; `missing`, the cases without an answer.
+        `targets`, what is to be reached beside what was; `strata`, per kind and lambda: number of cases, verdicts, rates
+        with intervals, size of the alias class, closed fraction and width of its interval, seconds, and `rivals`, of which
+        each has the same as far as it says it; `cases`, what was said of each; `missing`, the cases without an answer.
 
     Raises:
         InputError: the key is none, or no case has an answer.
@@ -80,6 +81,9 @@ def score(
     return {
         "format": "dtprob.score",
         "version": 2,
+        "targets": against_targets(
+            list(answers.values()), {rival: list(said.values()) for rival, said in theirs.items()}
+        ),
         "strata": [
             {
                 "kind": kind,

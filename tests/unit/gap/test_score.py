@@ -172,6 +172,19 @@ def test_rivals_stand_beside_each_stratum():
     assert ">lasso<" in render_score(found)
 
 
+def test_targets_are_counted_over_the_strata_that_they_speak_of():
+    found = {line["name"]: line for line in score(KEY, REPORTS)["targets"]}
+    assert (found["right effect first"]["count"], found["right effect first"]["of"]) == (1, 3)
+    assert (found["alarm without a gap"]["count"], found["alarm without a gap"]["of"]) == (1, 2)
+    assert "exact set of two" not in found  # the only pair carries too little information
+    assert (found["called unlisted and is not"]["count"], found["called unlisted and is not"]["of"]) == (0, 6)
+    assert (
+        found["closed fraction of .90 or more"]["count"],
+        found["closed fraction of .98 or more"]["count"],
+    ) == (1, 0)
+    assert "Against what is to be reached" in render_score(score(KEY, REPORTS))
+
+
 def test_wrong_keys_and_answers():
     with pytest.raises(InputError, match=r"key\.json"):
         score({"cases": [{"name": "a"}]}, {})
