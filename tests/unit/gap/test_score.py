@@ -116,10 +116,8 @@ def test_sizes_are_compared_where_truth_and_library_speak_of_the_same():
     assert answered("custom", wall, named=["wall[river]"], size=(8.0, 9.0)).covered_size() == [False]
     assert answered("custom", wall, named=["wall[railway]"], size=(7.0, 8.0)).covered_size() == []
     assert answered("network", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == []
-    bias = [true("regional_bias[x0_low]", 3.0)]  # the key does not tell the sign
-    assert answered("labels", bias, named=["regional_bias[x0_low]"], size=(-3.5, -2.5)).covered_size() == [
-        True
-    ]
+    jump = [true("handover", 3.0)]  # the key does not tell the sign
+    assert answered("custom", jump, named=["handover"], size=(-3.5, -2.5)).covered_size() == [True]
     gain = [true("gain_offset", 20 * 0.1 / 2.302585093)]  # decibels in truth, nepers in the library
     assert answered("channel", gain, named=["gain_offset"], size=(0.0999, 0.1001)).covered_size() == [True]
 
