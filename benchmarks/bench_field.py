@@ -3,9 +3,10 @@
     python benchmarks/bench_field.py [--links 50] [--side 8] [--subcarriers 64] [--samples 1000000] [--write]
 
 The rivals: Sionna RT, which solves for the paths at every step and differentiates through them with Dr.Jit (evaluated
-loops); and Dr.Jit on the stored paths with the formulas that JAX has, its program built at every step or kept. Channels
-between arrays of side x side antennas enter all of them through the same statistics. All run in turn in one process, and
-the figures are ratios of median times. --write keeps them in benchmarks/results/field.json.
+loops); the same without its search for paths, which it has no public way to leave out; and Dr.Jit on the stored paths
+with the formulas that JAX has, its program built at every step or frozen. Channels between arrays of side x side
+antennas enter all of them through the same statistics. All run in turn in one process, and the figures are ratios of
+median times. --write keeps them in benchmarks/results/field.json.
 """
 
 import argparse
@@ -17,8 +18,8 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from rival_drjit import mean_square, stored_in_drjit
 from record import record
+from rival_drjit import libraries, mean_square, stored_in_drjit
 
 from dtprob.physical.world import SPEED_OF_LIGHT, planar_array
 from dtprob.raytracing.calibration import Statistics, project
@@ -30,7 +31,7 @@ from dtprob.raytracing.sionna_patch import repaired_sionna
 from dtprob.raytracing.trace import load_scene, trace
 
 CARRIER, SPACING, SCALE = 3.5e9, 30e3, 1e10
-REPEATS = {"jax": 50, "drjit": 3, "drjit_frozen": 3, "sionna_rt": 1}
+REPEATS = {"jax": 50, "drjit": 3, "drjit_frozen": 3, "sionna_kept": 3, "sionna_rt": 1}
 
 
 def main() -> None:
@@ -45,7 +46,8 @@ def main() -> None:
         "jax": stored(paths, statistics, start),
         "drjit_frozen": stored_in_drjit(paths, statistics, start, SCALE, frozen=True),
         "drjit": stored_in_drjit(paths, statistics, start, SCALE, frozen=False),
-        "sionna_rt": traced_again(scene, paths, statistics, start, options.samples),
+        "sionna_kept": traced_again(scene, paths, statistics, start, options.samples, keep=True),
+        "sionna_rt": traced_again(scene, paths, statistics, start, options.samples, keep=False),
     }
     for name, step in steps.items():
         compare(name, steps["jax"](), step())
@@ -120,27 +122,32 @@ def stored(
 
 
 def traced_again(
-    scene: Any, paths: PathSet, statistics: Statistics, start: np.ndarray, samples: int
+    scene: Any, paths: PathSet, statistics: Statistics, start: np.ndarray, samples: int, *, keep: bool
 ) -> Callable[[], tuple[float, np.ndarray]]:
-    """The same, by Sionna's path solver at every step and Dr.Jit's derivatives; it is spared the channel."""
-    import drjit as dr  # noqa: PLC0415
-    import mitsuba as mi  # noqa: PLC0415
+    """The same, by Sionna's path solver at every step and Dr.Jit's derivatives; it is spared the channel.
 
+    With `keep` the solver finds paths once and computes their fields at every step, which it has no public way to do.
+    """
     rt = sionna_rt()
+    dr, mi = libraries()
     scene.tx_array = scene.rx_array = rt.PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="V")
+    scene.remove([*scene.transmitters, *scene.receivers])
     scene.add(rt.Transmitter("tx", np.asarray(paths.tx_position[0]).tolist()))
     for number, place in enumerate(np.asarray(paths.rx_position).tolist()):
         scene.add(rt.Receiver(f"rx-{number}", place))
     solver = rt.PathSolver(deterministic=True)
     solver.loop_mode = "evaluated"
     materials = [scene.radio_materials[name] for name in paths.material_names]
-    loss_of = mean_square(paths, statistics, SCALE)
+    loss_of, _ = mean_square(paths, statistics, SCALE)
 
     def solve() -> Any:
         with repaired_sionna(), large_table():
             return solver(scene, max_depth=3, samples_per_src=samples, refraction=False, seed=1)
 
     order = mi.UInt32(slots(solve(), paths))
+    if keep:
+        keep_paths(solver)
+        solve()
 
     def step() -> tuple[float, np.ndarray]:
         values = [[dr.opaque(mi.Float, float(value)) for value in pair] for pair in start.T]
@@ -155,6 +162,23 @@ def traced_again(
         return float(np.asarray(loss).reshape(-1)[0]), np.asarray(slopes).T
 
     return step
+
+
+def keep_paths(solver: Any) -> None:
+    """Let a solver hand its next paths to every later call."""
+    kept: list[Any] = []
+    generate, reflect = solver._candidate_generator, solver._image_method  # noqa: SLF001
+
+    def generated(**arguments: Any) -> Any:
+        return kept[0] if kept else generate(**arguments)
+
+    def reflected(**arguments: Any) -> Any:
+        if not kept:
+            kept.append(reflect(**arguments))
+            kept[0].shrink = lambda: None
+        return kept[0]
+
+    solver._candidate_generator, solver._image_method = generated, reflected  # noqa: SLF001
 
 
 def slots(found: Any, paths: PathSet) -> np.ndarray:
