@@ -133,6 +133,6 @@ PARAMETERS: Final[Mapping[str, Mapping[str, Sizes]]] = {
 }
 """Families whose size means the same in truth and library: the values that the library's one parameter can then have.
 
-A sign that the key does not tell may be either. Families whose shape is another in truth, as zones with soft edges are, have no
-size to compare: what the library's parameter should be is then not what the key holds.
+A sign that the key does not tell may be either. Families whose shape is another in truth, as zones with soft edges are,
+have no size to compare: what the library's parameter should be is then not what the key holds.
 """
