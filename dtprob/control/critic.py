@@ -39,7 +39,8 @@ class CentralCritic(eqx.Module):
     """Value of sending and of silence of each device, given the actions of all others.
 
     The selected device has a network of its own; the others share one, and their outputs are summed. Both see one of
-    few things, so that they are evaluated once for all of these, whatever the size of the batch.
+    few things, so that they are evaluated once for all of these, whatever the size of the batch; so is the head's first
+    layer, which is linear in their outputs.
 
     Attributes:
         own: what tells the devices apart, learned.
@@ -76,15 +77,17 @@ class CentralCritic(eqx.Module):
             action: of all devices.
         """
         inputs = _inputs(self.own, self.frame, self.capacity)
-        selected = jax.vmap(jax.vmap(self.selected))(inputs)
+        first, last = self.head.layers
+        of_selected, of_others = jnp.split(first.weight, 2, axis=1)
+        selected = jax.vmap(jax.vmap(self.selected))(inputs) @ of_selected.T + first.bias
         sign = jnp.ones((*inputs.shape[:2], 1), inputs.dtype)
         acting = jnp.stack([jnp.concatenate([inputs, s * sign], axis=2) for s in (-1, 1)])
-        other = jax.vmap(jax.vmap(jax.vmap(self.other)))(acting)
+        other = jax.vmap(jax.vmap(jax.vmap(self.other)))(acting) @ of_others.T
         device, place = jnp.arange(len(self.own)), _place(observation, self.frame, self.capacity)
         sends = action * (observation.buffer > 0)
         each = other[sends, device, place]
-        rest = jnp.sum(each, axis=0) - each
-        return jax.vmap(self.head)(jnp.concatenate([selected[device, place], rest], axis=1))
+        hidden = jax.nn.relu(selected[device, place] + jnp.sum(each, axis=0) - each)
+        return hidden @ last.weight.T + last.bias
 
 
 @final

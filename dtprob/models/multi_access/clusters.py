@@ -67,8 +67,8 @@ class Clusters:
 
     @cached_property
     def cluster_of(self) -> Int[np.ndarray, " device"]:
-        """The cluster of each device."""
-        return np.argmax(self.weight > 0, axis=0)
+        """The cluster of each device; 32 bits, so that it is the same index in either precision of JAX."""
+        return np.argmax(self.weight > 0, axis=0).astype(np.int32)
 
     @cached_property
     def arrives(self) -> Bool[np.ndarray, "cluster device outcome"]:

@@ -100,11 +100,11 @@ class PhysicalKernel:
             action: 1 to send, 0 to be silent; a device without a packet is silent.
         """
         devices, clusters = self.devices, len(self.clusters)
-        uniform = jax.random.uniform(key, (devices + clusters + 1,))
+        uniform = jax.random.uniform(key, (_rounded(devices + clusters + 1),))
         sends = action.astype(state.buffer.dtype) * (state.buffer > 0)
         deliveries = _inverse(parameters["log_reception"][jnp.sum(sends)], uniform[0])
         ack = _choose(sends, deliveries, uniform[1 : devices + 1])
-        arrival = self._arrivals(parameters["log_arrival"], state.arrival, uniform[devices + 1 :])
+        arrival = self._arrivals(parameters["log_arrival"], state.arrival, uniform[devices + 1 : devices + 1 + clusters])
         overflow = (state.buffer == self.capacity) * arrival * (1 - ack)
         buffer = jnp.clip(state.buffer + arrival - ack, 0, self.capacity)
         slot = Slot(ack, overflow, jnp.sum(sends) > deliveries, self._reward(ack, overflow))
@@ -138,6 +138,11 @@ def _digits(clusters: Clusters) -> tuple[np.ndarray, np.ndarray]:
         for place, device in enumerate(reversed(cluster)):
             own[device], weight[device] = number, 2**place
     return own, weight
+
+
+def _rounded(count: int) -> int:
+    """A multiple of 16: such rows of uniform numbers are drawn twice as fast as shorter ones, and begin the same."""
+    return -(-count // 16) * 16
 
 
 def _inverse(log_probability: Float[Array, " outcome"], uniform: Scalar) -> Int[Array, ""]:
