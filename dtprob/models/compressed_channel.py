@@ -8,6 +8,7 @@ from `dtprob.raytracing.calibration.project`. Effects that change the paths' res
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any, Final, Literal
 
 import jax
@@ -22,7 +23,7 @@ from dtprob.errors import InputError
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
 from dtprob.models.scene import AXES, Materials, site, traced_gain, unknown_noise_power, unknown_phase
-from dtprob.raytracing.calibration import Statistics
+from dtprob.raytracing.calibration import Statistics, project
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.slab import Law
 
@@ -58,6 +59,18 @@ def compress(statistics: Statistics) -> dict[str, Any]:
         "size": statistics.size,
         "compressed": compressed,
     }
+
+
+def compress_measured(measured: Mapping[str, Any]) -> dict[str, Any]:
+    """Arguments of `compressed_channel` from a measurement.
+
+    Args:
+        measured: the arrays of `dtprob.data.ChannelData` by name, and `paths`.
+    """
+    arrays = {name: measured.get(name) for name in ("rx_array", "tx_array")}
+    given = {name: None if array is None else jnp.asarray(array) for name, array in arrays.items()}
+    channel, tones = (jnp.asarray(measured[name]) for name in ("channel", "subcarrier_frequency"))
+    return compress(project(measured["paths"], tones, channel, powers=False, **given))
 
 
 @model(axes=_AXES, cluster="link")

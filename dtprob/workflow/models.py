@@ -19,12 +19,15 @@ class Entry:
         derived: arguments that are computed from the others, each by a function of them, "module:function".
         arrange: for data that are no arguments as they are, the function "module:function" from the data, and
             options by name, to the arguments; its options can stand in [model.options] beside the model's.
+        reduce: for a model that sees statistics of the data and not the data, the function "module:function" from the
+            data and the arguments so far, by name, to the arguments that they become.
     """
 
     function: str
     data: type
     derived: Mapping[str, str] = field(default_factory=dict)
     arrange: str | None = None
+    reduce: str | None = None
 
     def load(self) -> Model:
         """The model itself."""
@@ -33,6 +36,10 @@ class Entry:
     def derive(self, arguments: Mapping[str, Any]) -> dict[str, Any]:
         """The arguments that are computed from the others."""
         return {name: _load(function)(arguments) for name, function in self.derived.items()}
+
+    def reduced(self, known: Mapping[str, Any]) -> dict[str, Any]:
+        """The arguments that stand for the data where the model sees statistics of them."""
+        return {} if self.reduce is None else _load(self.reduce)(known)
 
     def arranger(self) -> Callable[..., dict[str, Any]] | None:
         """The function from data to arguments, if there is one."""
@@ -47,6 +54,11 @@ def _load(function: str) -> Callable[..., Any]:
 MODELS: Mapping[str, Entry] = {
     "phase_error_channel": Entry("dtprob.models.channel:phase_error_channel", ChannelData),
     "ray_traced_channel": Entry("dtprob.models.channel:ray_traced_channel", ChannelData),
+    "compressed_channel": Entry(
+        "dtprob.models.compressed_channel:compressed_channel",
+        ChannelData,
+        reduce="dtprob.models.compressed_channel:compress_measured",
+    ),
     "received_power": Entry(
         "dtprob.models.received_power:received_power",
         PowerData,

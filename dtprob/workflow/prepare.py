@@ -182,6 +182,7 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
     arguments |= _phase(case, data, takes="phase" in takes)
     if case.model.name in MODELS:
         arguments |= {name: jnp.asarray(v) for name, v in MODELS[case.model.name].derive(arguments).items()}
+        arguments |= MODELS[case.model.name].reduced({**columns, **arguments})
     own = [] if arrange is None else list(inspect.signature(arrange).parameters)[1:]
     return arguments | _options(case, takes, arguments, own)
 

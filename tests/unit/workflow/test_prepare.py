@@ -7,6 +7,8 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpyro import handlers
+from numpyro.infer.util import log_density
 
 from dtprob.case import load_case
 from dtprob.data import ChannelData, read, write
@@ -50,6 +52,23 @@ def test_arguments_of_a_ray_traced_model(folder):
     assert prepared.effects == ()
     assert prepared.engine.name == "laplace"
     assert len(prepared.data_sha256) == 64
+
+
+def test_a_model_on_statistics_of_the_data(folder):
+    whole = prepare(load_case(folder / "case.toml"), need="fit")
+    short = prepare(load_case(change(folder, "ray_traced_channel", "compressed_channel")), need="diagnosis")
+    assert short.data["phase"] == "coherent"
+    assert "channel" not in short.data
+    assert "timing_offset" not in {effect.family for effect in short.effects}  # there is no delay to act on
+    assert "material_mismatch" in {effect.family for effect in short.effects}
+    differences = []
+    for seed in range(2):
+        trace = handlers.trace(handlers.seed(whole.model, seed)).get_trace(**whole.data)
+        values = {n: m["value"] for n, m in trace.items() if m["type"] == "sample" and not m["is_observed"]}
+        densities = [float(log_density(p.model, (), dict(p.data), values)[0]) for p in (whole, short)]
+        differences.append(densities[0] - densities[1])
+        scale = abs(densities[0])
+    assert differences[0] == pytest.approx(differences[1], abs=1e-5 * scale)
 
 
 def test_effects_by_name_and_without_some(folder):
