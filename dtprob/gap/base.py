@@ -18,19 +18,19 @@ _PEAKS = 3
 _MOST = 24
 _SHORT = 4
 _LONG = 3
-_POLISHED = 3
 _ENOUGH = 3
 _SAME = 0.1
 _COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
 
 
-def fit_base(problem: Problem, key: jax.Array, starts: int = 8) -> fitting.Fit:
+def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 3) -> fitting.Fit:
     """Posterior mode of the model without effects, the best of several starts.
 
     Args:
         problem: the model on its data.
         key: for prior draws.
         starts: the centre of the prior and at most this many less one draws from it; fewer where the best agree.
+        polished: how many of the fits, the best of each optimum, are freed from local optima.
 
     Raises:
         InputError: the model has no finite likelihood from any start.
@@ -51,7 +51,9 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8) -> fitting.Fit:
             "none from any start",
             "Check the units of the data and the priors of the model; dtprob.testing.check_model names what breaks.",
         )
-    return max((polish(problem, f) for f in _apart(fits)[:_POLISHED]), key=lambda f: f.log_posterior)
+    found = _apart(fits)
+    freed = [polish(problem, fitted) for fitted in found[:polished]]
+    return max([*freed, *found[polished:]], key=lambda f: f.log_posterior)
 
 
 def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:

@@ -86,16 +86,14 @@ def _where(evidence: Evidence) -> dict[str, Any]:
     accepted = {e.name: e for e in evidence.problem.effects if e.name in evidence.accepted}
     own = {site for e in accepted.values() for site in e.sites}
     closed_share = evidence.fraction.mean if evidence.fraction is not None else 0.0
-    sites: list[dict[str, Any]] = [
-        {
-            "site": s.site,
-            "p_value": s.p_value,
-            "share": max(min(s.gain / total, 1.0), closed_share if s.site in own else 0.0),
-        }
-        for s in evidence.before.sites
-    ]
+    shares = {
+        s.site: max(min(s.gain / total, 1.0), closed_share * (s.site in own)) for s in evidence.before.sites
+    }
     return {
-        "sites": sorted(sites, key=lambda s: (-s["share"], s["p_value"])),
+        "sites": [
+            {"site": s.site, "p_value": s.p_value, "share": shares[s.site]}
+            for s in sorted(evidence.before.sites, key=lambda s: (s.last, -shares[s.site], s.p_value))
+        ],
         "coordinates": [
             {
                 "axes": {c.axis: [c.low, c.high]},
@@ -233,7 +231,11 @@ def _maps(evidence: Evidence) -> dict[str, xr.Dataset]:
         coords={"effect": list(first.names), "other_effect": list(first.names)},
     )
     group = "links" if name == "link" else "clusters"
-    return {"where": xr.Dataset({**where, **after}), group: xr.Dataset(clusters), "screening": screening}
+    return {
+        "where": xr.Dataset({**where, **after}),
+        group: xr.Dataset(clusters, attrs={"floor": entropy}),
+        "screening": screening,
+    }
 
 
 def _seed(key: jax.Array) -> int:

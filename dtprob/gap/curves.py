@@ -1,31 +1,82 @@
-"""Ways for a perturbation to vary along an axis: smoothly, and with each data column that lies along it."""
+"""Ways for a perturbation to vary along an axis: smoothly, as a ripple, with the data's columns, or by their groups."""
 
 from __future__ import annotations
 
+import itertools
+from typing import Final
+
 import equinox as eqx
 import numpy as np
+from scipy import sparse, stats
 
 from dtprob.gap.problem import Problem
 
-_SMOOTH_FROM = 6
-_ORDER = 4
+_SMOOTH_FROM: Final = 6
+_ORDER: Final = 4
+"""Half waves of what counts as smooth."""
+_FINEST: Final = 128
+"""Half waves of the finest ripple that is looked for."""
+_CROSSED: Final = 3
+"""Half waves along each of two columns of what varies over both."""
+_MOST_PAIRS: Final = 6
+
+type Curves = dict[str, sparse.csr_matrix]
 
 
-def curves(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
+def curves(problem: Problem, axis: str, size: int) -> Curves:
     """Curves (curve, size) along an axis by family name; none where the axis is short."""
     if size < _SMOOTH_FROM:
         return {}
-    position = (np.arange(size) + 0.5) / size
-    found = {f"smooth in {axis}": np.cos(np.pi * np.outer(np.arange(1, _ORDER + 1), position))}
+    place = (np.arange(size) + 0.5) / size
+    found = {f"smooth in {axis}": _waves(place, 1, _ORDER)}
+    low = _ORDER + 1
+    while low < min(size, _FINEST):
+        high = min(2 * (low - 1), size - 1)
+        found[f"ripple in {axis}, {low} to {high} half waves"] = _waves(place, low, high)
+        low = high + 1
+    columns = _columns(problem, axis, size)
+    for name, column in columns.items():
+        groups, index = np.unique(column, return_inverse=True)
+        if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
+            found[f"along {name}"] = _waves(_rank(column), 1, _ORDER)
+        else:
+            found[f"by {name}"] = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
+    smooth = [name for name, column in columns.items() if np.issubdtype(column.dtype, np.floating)]
+    for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
+        crossed = _waves(_rank(columns[one]), 1, _CROSSED), _waves(_rank(columns[other]), 1, _CROSSED)
+        products = crossed[0].toarray()[:, None] * crossed[1].toarray()[None]
+        found[f"over {one} and {other}"] = sparse.csr_matrix(products.reshape(-1, size))
+    return found
+
+
+def _waves(place: np.ndarray, low: int, high: int) -> sparse.csr_matrix:
+    """Cosines of low to high half waves over places (size,) in (0, 1)."""
+    return sparse.csr_matrix(np.cos(np.pi * np.outer(np.arange(low, high + 1), place)))
+
+
+def _rank(column: np.ndarray) -> np.ndarray:
+    """Ranks (size,) in (0, 1), so that a few far values do not bend the curves."""
+    return (stats.rankdata(column) - 0.5) / len(column)
+
+
+def _columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
+    """Columns of the data (size,) that lie along an axis of the observations and vary; of positions each coordinate."""
     observed = problem.declaration.observed.values()
     if not any(axis in site.axes for site in observed):
-        return found
+        return {}
     arguments = {site.argument for site in observed}
+    found: dict[str, np.ndarray] = {}
     for name, values in problem.data.items():
         if name in arguments or not eqx.is_array_like(values):
             continue
         column = np.asarray(values)
-        if column.shape == (size,) and np.issubdtype(column.dtype, np.floating) and column.std() > 0:
-            z = (column - column.mean()) / column.std()
-            found[f"along {name}"] = np.stack([z, z**2 - 1.0])
-    return found
+        if column.shape == (size,):
+            found[name] = column
+        elif column.ndim == 2 and column.shape[0] == size and column.shape[1] <= 3:
+            found |= {f"{name}[{i}]": part for i, part in enumerate(column.T)}
+    real = (np.floating, np.integer, np.bool_)
+    return {
+        name: column
+        for name, column in found.items()
+        if any(np.issubdtype(column.dtype, kind) for kind in real) and len(np.unique(column)) > 1
+    }

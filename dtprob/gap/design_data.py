@@ -14,8 +14,9 @@ from dtprob.gap.active import activate, basis
 from dtprob.gap.design import Design, Prediction, Ranked, joined, rank, recommend
 from dtprob.gap.diagnosis import Cause
 from dtprob.gap.evidence import Evidence
-from dtprob.gap.fit import Fit
+from dtprob.gap.fit import Fit, fit
 from dtprob.gap.problem import Problem
+from dtprob.gap.trials import Start
 from dtprob.models.declaration import Data
 
 _SHOWN: Final = 5
@@ -43,12 +44,13 @@ def next_measurement(
     """
     if not causes or len(causes[0].alias_class) < 2:
         return None
-    step = next(s for s in reversed(evidence.steps) if s.accepted is not None)
-    fits = [step.trials[names[-1]] for names in causes[0].alias_class]
-    again = designs_of(step.problem, step.problem, fits, _AGAIN)
+    found = evidence.explanations
+    here = evidence.problem.with_live([name for names in causes[0].alias_class for name in names])
+    fits = [_moved(here, found[names]) for names in causes[0].alias_class]
+    again = designs_of(here, here, fits, _AGAIN)
     candidates = list(again)
     for name, data in designs.items():
-        candidates += designs_of(_problem_at(step.problem, data), step.problem, fits, name)
+        candidates += designs_of(_problem_at(here, data), here, fits, name)
     everything = rank([joined(again)])[0]
     best = recommend(candidates)
     return {
@@ -61,6 +63,12 @@ def next_measurement(
         "cost_of_all_again": everything.cost if everything.resolves else None,
         "ranking": [_line(one) for one in rank(candidates)[:_SHOWN]],
     }
+
+
+def _moved(here: Problem, at: Start) -> Fit:
+    """A fit in the coordinates of another problem on the same data."""
+    x = here.translate(at.fitted.x, at.problem)
+    return fit(here, x, at.fitted.effects, spread=at.fitted.spread)
 
 
 def designs_of(there: Problem, here: Problem, fits: Sequence[Fit], name: str) -> list[Design]:

@@ -19,9 +19,10 @@ from dtprob.gap.design_data import next_measurement
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.problem import Problem
-from dtprob.gap.search import Say, alarmed, search
+from dtprob.gap.search import search
 from dtprob.gap.settings import Settings
 from dtprob.gap.shares import shares
+from dtprob.gap.trials import Say
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.declaration import Data, Model
@@ -84,7 +85,7 @@ def diagnose(
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
     keys = jax.random.split(key, 4)
     say(f"fitting the base model to {problem.n_cluster} clusters")
-    base = fit_base(problem, keys[0])
+    base = fit_base(problem, keys[0], polished=settings.polished)
     steps = search(problem, base, keys[1], settings, say)
     base, last = steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
@@ -131,23 +132,24 @@ def _causes(
 
 
 def alternatives(evidence: Evidence, settings: Settings) -> tuple[tuple[tuple[str, ...], ...], float]:
-    """Sets that differ from the accepted one in its last effect and that the data cannot rule out; its probability."""
-    step = next(s for s in reversed(evidence.steps) if s.accepted is not None)
-    names = list(step.trials)
-    evidences = np.array([step.trials[n].log_evidence for n in names])
+    """Sets that differ from the accepted one in one effect and that the data cannot rule out; its probability."""
+    found = evidence.explanations
+    names = list(found)
+    evidences = np.array([found[n].fitted.log_evidence for n in names])
     weights = np.exp(evidences - evidences.max())
     weights /= weights.sum()
     order = np.argsort(-weights)
     held = np.cumsum(weights[order])
     count = int(np.searchsorted(held, settings.credibility)) + 1
-    classes = tuple((*step.view.fitted.effects, names[int(i)]) for i in order[:count])
-    return classes, float(weights[names.index(str(step.accepted))])
+    classes = tuple(names[int(i)] for i in order[:count])
+    own = next(i for i, n in enumerate(names) if set(n) == set(evidence.accepted))
+    return classes, float(weights[own])
 
 
 def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) -> str:
     """The verdict."""
     level = settings.level / 2
-    if not alarmed(evidence.steps[0].view, settings) or _negligible(evidence, settings):
+    if not evidence.steps[0].view.alarmed(settings) or _negligible(evidence, settings):
         return "NO_GAP"
     if not causes:
         return "UNLISTED" if evidence.before.site_p_value <= level else "UNDETERMINED"

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from dtprob.gap.closed import ClosedFraction, HeldOut
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
-from dtprob.gap.search import Step, View
+from dtprob.gap.search import Step
 from dtprob.gap.shares import Share
+from dtprob.gap.trials import Start
+from dtprob.gap.view import View
 from dtprob.gap.where import Location
 
 
@@ -49,3 +51,15 @@ class Evidence:
     def accepted(self) -> tuple[str, ...]:
         """Names of the accepted effects."""
         return self.fitted.effects
+
+    @property
+    def explanations(self) -> dict[tuple[str, ...], Start]:
+        """Sets of effects that differ from the accepted one in one effect at most, fitted; each with its problem."""
+        found = {frozenset(self.accepted): Start(self.last.problem, self.fitted)}
+        for step in self.steps:
+            rest = step.view.fitted.effects
+            if step.accepted is None or {*rest, step.accepted} != set(self.accepted):
+                continue
+            for fitted in step.trials.fits.values():
+                found.setdefault(frozenset(fitted.effects), Start(step.trials.problem, fitted))
+        return {one.fitted.effects: one for one in found.values()} if self.accepted else {}

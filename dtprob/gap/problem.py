@@ -72,8 +72,8 @@ class Problem:
         self.__dict__.pop("compiled", None)
         self.live = live
         shapes, families = self._observed_shapes()
-        located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
-        self.rows: Rows = make_rows(self.declaration, shapes, located, self.data, self._column)
+        self.located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
+        self.rows: Rows = make_rows(self.declaration, shapes, self.located, self.data, self._column)
         self.layout: Layout = self._make_layout()
         self._runner = Runner(
             self.model,

@@ -123,3 +123,13 @@ def starting_points(
     ordered = sorted(best[1:], key=lambda b: -b[0])[: settings.starts]
     floor = values[0] if len(ordered) else -np.inf
     return [one_step] + [start for value, start in ordered if value > floor - 5.0]
+
+
+def at_null_except(problem: Problem, fitted: fitting.Fit, kept: Sequence[str]) -> np.ndarray:
+    """The point of a fit with all its effects but those kept back at their null."""
+    x, null = fitted.x.copy(), problem.null()
+    for name in fitted.effects:
+        if name not in kept:
+            for block in problem.blocks_of(name):
+                x[block.index] = null[block.index]
+    return x

@@ -41,6 +41,12 @@ class Rows:
         flat = jnp.concatenate([*(value.reshape(-1) for value in rows.values()), jnp.zeros(1)])
         return flat[self.gather]
 
+    def unstack(self, rows: np.ndarray) -> np.ndarray:
+        """Rows (..., cluster, row) as (..., flat), as they lie in the observed sites one after another."""
+        flat = np.zeros((*rows.shape[:-2], len(self.ids) + 1), rows.dtype)
+        flat[..., self.gather] = rows
+        return flat[..., :-1]
+
     def by_cluster(self, values: np.ndarray) -> np.ndarray:
         """A flat per-row array as (cluster, row), padded with -1."""
         return np.concatenate([values, [-1]])[self.gather]

@@ -14,7 +14,7 @@ class Settings:
         replicates: bootstrap replicates of the score statistics.
         site_replicates: bootstrap replicates of the site tests; each costs about one gradient.
         candidates: how many effects are refitted in full at each step of the search.
-        polished: how many of these, the best, are also freed from local optima of the nuisances.
+        polished: how many of these, and of the fits of the base model, are also freed from local optima of the nuisances.
         max_effects: the largest set of effects that is looked for.
         folds: parts of the clusters for cross-fitted held-out losses.
         grid: trial sizes per effect parameter when a refit looks for its starting points.

@@ -19,6 +19,7 @@ from jaxtyping import Float
 from dtprob.gap import fit as fitting
 from dtprob.gap.closed import HeldOut, cross_fit
 from dtprob.gap.problem import Problem
+from dtprob.gap.refit import at_null_except
 
 _DRAWS = 2000
 
@@ -84,7 +85,7 @@ def shares(
     value = {frozenset(): held[0].log_likelihood, frozenset(effects): held[1].log_likelihood}
     for size in range(1, len(effects)):
         for chosen in combinations(effects, size):
-            start = _without_others(problem, fitted, chosen)
+            start = at_null_except(problem, fitted, chosen)
             part = fitting.fit(problem, start, chosen, spread=fitted.spread)
             value[frozenset(chosen)] = cross_fit(problem, part, assignment).log_likelihood
     gained = value[frozenset(effects)] - value[frozenset()]
@@ -108,13 +109,3 @@ def shares(
             )
         )
     return tuple(found)
-
-
-def _without_others(problem: Problem, fitted: fitting.Fit, chosen: Sequence[str]) -> np.ndarray:
-    """The point of a fit with the effects that are not chosen back at their null."""
-    x, null = fitted.x.copy(), problem.null()
-    for name in fitted.effects:
-        if name not in chosen:
-            for block in problem.blocks_of(name):
-                x[block.index] = null[block.index]
-    return x

@@ -1,28 +1,27 @@
 """Where the gap lies: over the model's sites and over the data's coordinates, each map with family-wise control.
 
-Site families are made from the model's own trace: each deterministic site, perturbed additively or in proportion,
-independently per entry, pooled along axes, smooth along an axis or along a column of the data. One gradient per bootstrap
-replicate serves all of them.
+Sites are the model's deterministic ones and the spreads of what is observed. One gradient per bootstrap replicate serves
+all families of all sites.
 """
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.bootstrap import Replicates
-from dtprob.gap.curves import curves
+from dtprob.gap.families import Family, Site, deterministic, families, observed, shifted
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
 from dtprob.gap.tails import family_wise, gamma_tail
 
+_SURE = 0.005
+"""Probability below which a site is surely wrong."""
 _CHANCE = 8
 """Replicates that tell what a site would gain by chance."""
 
@@ -33,15 +32,17 @@ class SiteFinding:
 
     Attributes:
         site: its name.
-        family: "additive" or "relative", and the axes along which the perturbation varies.
+        family: what is added ("additive", "relative", "conjugate", "spread", ...) and how it varies.
         p_value: family-wise over all sites and families.
         gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order.
+        last: whether it is the spread of an observation where another site is surely wrong: a wrong mean spreads too.
     """
 
     site: str
     family: str
     p_value: float
     gain: float
+    last: bool = False
 
 
 @dataclass(frozen=True)
@@ -75,150 +76,86 @@ class Location:
 def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> Location:
     """Test every site family and every block of coordinates at a fit."""
     at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
-    values = {n: np.asarray(v) for n, v in at.items() if n in drawn.gradients}
-    tested = {name: _family_test(score) for name, score in _scores(problem, drawn.gradients, values)}
-    p = np.array([family.p_value for family in tested.values()])
-    null = [family.null for family in tested.values()]
-    adjusted = family_wise(p, np.stack(null, axis=1).min(axis=1)) if null else np.ones(0)
-    by_name = dict(zip(tested, adjusted, strict=True))
-    findings = _best_per_site(
-        problem, fitted, projection, drawn, adjusted=by_name, tested=tested, values=values
-    )
+    axes = {name: site.axes for name, site in problem.declaration.sites.items()}
+    found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
+    found += observed(problem, jnp.concatenate([drawn.observed[None], drawn.projected]))
+    tested = [[_family_test(*family) for family in families(problem, site)] for site in found]
+    null = [test.null for tests in tested for test in tests]
+    smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
+    findings = [
+        _finding(problem, fitted, projection, drawn, site=site, tests=tests, smallest=smallest)
+        for site, tests in zip(found, tested, strict=True)
+    ]
     blocks, maps = _coordinates(problem, np.asarray(drawn.observed), np.asarray(drawn.projected))
-    return Location(findings, blocks, maps, float(adjusted.min(initial=1.0)))
+    ordered = tuple(sorted(_spreads_last(findings), key=lambda f: (f.last, f.p_value, -f.gain)))
+    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0))
 
 
-class _Family(NamedTuple):
+def _spreads_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
+    spread = [f.family.startswith("spread") for f in findings]
+    sure = any(f.p_value <= _SURE and not s for f, s in zip(findings, spread, strict=True))
+    return [replace(f, last=sure and s) for f, s in zip(findings, spread, strict=True)]
+
+
+class _Test(NamedTuple):
     """A site family's test.
 
     Attributes:
+        family: what was tested.
         p_value: of the data.
         null: p-value of each replicate.
         first: scores (1 + _CHANCE, entry) of the data and of the first replicates.
         variance: of the scores, (entry,).
     """
 
+    family: Family
     p_value: float
     null: np.ndarray
     first: np.ndarray
     variance: np.ndarray
 
 
-def _scores(
-    problem: Problem, gradients: Mapping[str, jax.Array], values: Mapping[str, np.ndarray]
-) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
-    """(site, family) and scores (1 + replicate, entry) of every site family, one after another."""
-    for site, gradient in gradients.items():
-        g, axes = np.asarray(gradient), problem.declaration.sites[site].axes
-        for kind, entry in (("additive", g), ("relative", g * values[site])):
-            parts = (
-                np.stack([np.real(entry), np.imag(entry)], -1) if np.iscomplexobj(entry) else entry[..., None]
-            )
-            shape = entry.shape[1:]
-            for kept in _kept_axes(shape):
-                summed = parts.sum(axis=tuple(1 + i for i in range(len(shape)) if i not in kept))
-                label = f"{kind}, " + (" x ".join(axes[i] for i in kept) if kept else "common")
-                yield (site, label), summed.reshape(len(g), -1)
-            for i, axis in enumerate(axes):
-                for name, curve in curves(problem, axis, shape[i]).items():
-                    along = parts.sum(axis=tuple(1 + j for j in range(len(shape)) if j != i))
-                    yield (site, f"{kind}, {name}"), (curve @ along).reshape(len(g), -1)
-
-
-def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
-    """Axes along which a perturbation varies: none, one, all but one, all."""
-    wide = [i for i, n in enumerate(shape) if n > 1]
-    sizes = sorted({0, 1, len(wide) - 1, len(wide)} & set(range(len(wide) + 1)))
-    for size in sizes:
-        yield from itertools.combinations(wide, size)
-
-
-def _family_test(scores: np.ndarray) -> _Family:
+def _family_test(family: Family, scores: np.ndarray) -> _Test:
     """Test a family's summed squared scores (1 + replicate, entry), each entry scaled by its null variance."""
     first, n = scores[: 1 + _CHANCE].copy(), len(scores) - 1
-    observed, null = scores[0], scores[1:]
+    given, null = scores[0], scores[1:]
     total = (null**2).sum(0)
     variance = total / n
     alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
     if not alive.any():
-        return _Family(1.0, np.ones(n), first, variance)
-    null, observed, total = null[:, alive], observed[alive], total[alive]
+        return _Test(family, 1.0, np.ones(n), first, variance)
+    null, given, total = null[:, alive], given[alive], total[alive]
     left_out = (total - null**2) / (n - 1)
     known = left_out > 1e-9 * total / n  # rare outcomes move an entry in one replicate and in no other
     statistic = (np.where(known, null**2, 0.0) / np.where(known, left_out, 1.0)).sum(1)
-    value = float((observed**2 / (total / n)).sum())
+    value = float((given**2 / (total / n)).sum())
     mean, spread = statistic.mean(), statistic.var()
     p_null, _ = gamma_tail(statistic, np.asarray(mean), np.asarray(spread))
     p, _ = gamma_tail(np.asarray([value]), np.asarray(mean), np.asarray(spread))
-    return _Family(float(p[0]), p_null, first, variance)
+    return _Test(family, float(p[0]), p_null, first, variance)
 
 
-def _best_per_site(
+def _finding(
     problem: Problem,
     fitted: Fit,
     projection: Projection,
     drawn: Replicates,
     *,
-    adjusted: Mapping[tuple[str, str], float],
-    tested: Mapping[tuple[str, str], _Family],
-    values: Mapping[str, np.ndarray],
-) -> tuple[SiteFinding, ...]:
-    """For each site the family with the smallest p-value, with the gain along its steepest direction."""
-    findings = []
-    for site, value in values.items():
-        best = min(
-            (n for n in adjusted if n[0] == site),
-            key=lambda n: (adjusted[n], -float((tested[n].first[0] ** 2).sum())),
-        )
-        shape = drawn.gradients[site].shape[1:]
-        grown = np.broadcast_to(value, shape)
-        family = tested[best]
-        steps = [_direction(problem, best, score, family.variance, grown) for score in family.first]
-        shifts = projection.rows(
-            jnp.moveaxis(problem.compiled.site_shift(fitted.x, {site: np.stack(steps)}), -1, 0)
-        )
-        rows = jnp.concatenate([drawn.observed[None], drawn.projected[:_CHANCE]])
-        slope = np.asarray(jnp.einsum("ncm,ncm->n", shifts, rows))
-        curvature = np.asarray(jnp.einsum("ncm,ncm->n", shifts, shifts))
-        gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)
-        net = max(float(gain[0] - gain[1:].mean()), 0.0)
-        findings.append(SiteFinding(site, best[1], float(adjusted[best]), net))
-    return tuple(sorted(findings, key=lambda f: (f.p_value, -f.gain)))
-
-
-def _direction(
-    problem: Problem, name: tuple[str, str], score: np.ndarray, variance: np.ndarray, value: np.ndarray
-) -> np.ndarray:
-    """The site perturbation that a family's scores point to, of the site's shape and dtype."""
-    site, family = name
-    axes = problem.declaration.sites[site].axes
-    relative = family.startswith("relative")
-    label = family.split(", ", 1)[1]
-    for i, axis in enumerate(axes):
-        curve = curves(problem, axis, value.shape[i]).get(label)
-        if curve is not None:
-            step = _along(score, variance, value, curve)
-            shape = [n if j == i else 1 for j, n in enumerate(value.shape)]
-            return np.broadcast_to(step.reshape(shape), value.shape) * (value if relative else 1.0)
-    kept = [] if label == "common" else label.split(" x ")
-    floor = 1e-12 * max(float(variance.max(initial=0.0)), 1e-300)
-    step = np.where(variance > floor, score / np.where(variance > floor, variance, 1.0), 0.0)
-    shape = [n if axes[i] in kept and n > 1 else 1 for i, n in enumerate(value.shape)]
-    if np.iscomplexobj(value):
-        pair = step.reshape(*shape, 2)
-        step_array = pair[..., 0] - 1j * pair[..., 1]
-    else:
-        step_array = step.reshape(shape)
-    return np.broadcast_to(step_array, value.shape) * (value if relative else 1.0)
-
-
-def _along(score: np.ndarray, variance: np.ndarray, value: np.ndarray, curves: np.ndarray) -> np.ndarray:
-    """Step along one axis that the scores of curves on it point to."""
-    weight = score / np.maximum(variance, 1e-12 * max(float(variance.max(initial=0.0)), 1e-300))
-    if np.iscomplexobj(value):
-        pair = weight.reshape(len(curves), 2)
-        return curves.T @ (pair[:, 0] - 1j * pair[:, 1])
-    return curves.T @ weight
+    site: Site,
+    tests: Sequence[_Test],
+    smallest: np.ndarray,
+) -> SiteFinding:
+    """The family of a site with the smallest p-value, with the gain along its steepest direction."""
+    best = min(tests, key=lambda test: (test.p_value, -float((test.first[0] ** 2).sum())))
+    steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
+    shifts = projection.rows(shifted(problem, fitted.x, site, steps))
+    rows = jnp.concatenate([drawn.observed[None], drawn.projected[:_CHANCE]])
+    slope = np.asarray(jnp.einsum("ncm,ncm->n", shifts, rows))
+    curvature = np.asarray(jnp.einsum("ncm,ncm->n", shifts, shifts))
+    gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)
+    net = max(float(gain[0] - gain[1:].mean()), 0.0)
+    p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
+    return SiteFinding(site.name, best.family.label, p_value, net)
 
 
 def _coordinates(

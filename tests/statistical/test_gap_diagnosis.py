@@ -97,7 +97,7 @@ def run(model, data, effects=EFFECTS, key=0, engine=None, **options):
     return diagnose(model, data, effects, key=jax.random.key(key), engine=engine or Started(), **options)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(1, 5))
 def test_no_gap_where_there_is_none(seed):
     found = run(line, draw("line", seed=seed), key=seed)
     assert found.verdict == "NO_GAP"

@@ -12,9 +12,9 @@ from dtprob.gap.plausible import SCALES
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import project
 from dtprob.gap.screen import screen
-from dtprob.gap.search import view
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise, gamma_tail
+from dtprob.gap.view import view
 from dtprob.gap.where import locate
 from dtprob.models.declaration import split_static
 from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation

@@ -102,7 +102,8 @@ def inputs(seed=0, n_link=N_LINK, n_sample=N_SAMPLE):
 
 
 def draw(name, seed=1, shift=0.0, x=None):
-    """Data of a model at its values, with `shift` added to the site "mean"."""
+    """Data of a model at its values, with `shift` added to the site "mean"; seed 0 is that of the inputs."""
+    assert seed, "the noise would be the inputs once more"
     rng, (_, values) = np.random.default_rng(seed), MODELS[name]
     x = inputs() if x is None else x
     noise = rng.normal(size=x.shape)

@@ -1,0 +1,185 @@
+"""Ways in which the values of a site may be wrong, made from the model's own trace and the data's columns.
+
+A perturbation is a factor (the same for all, the value itself, its conjugate, its neighbour) times a pattern: weights that
+are shared along some axes, that vary smoothly or as a ripple along one, with a column of the data, or by a column's groups.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy import sparse
+
+from dtprob.gap.curves import curves
+from dtprob.gap.problem import Problem
+
+
+@dataclass(frozen=True)
+class Pattern:
+    """Weights that stand for a perturbation of a whole site.
+
+    Attributes:
+        label: how it varies, in words.
+        kept: axes of the site along which it varies.
+        curves: (weight, size of the one axis that is kept), or None for a weight of its own at every position.
+    """
+
+    label: str
+    kept: tuple[int, ...]
+    curves: sparse.csr_matrix | None = None
+
+    def scores(self, entries: np.ndarray) -> np.ndarray:
+        """Scores (n, weight x part) of the weights from those of the entries (n, *site, part)."""
+        gone = tuple(1 + i for i in range(entries.ndim - 2) if i not in self.kept)
+        summed = entries.sum(axis=gone)
+        if self.curves is None:
+            return summed.reshape(len(entries), -1)
+        n, size, part = summed.shape
+        mixed = self.curves @ np.moveaxis(summed, 1, 0).reshape(size, n * part)
+        return np.moveaxis(mixed.reshape(-1, n, part), 0, 1).reshape(n, -1)
+
+    def perturbation(self, weights: np.ndarray, shape: Sequence[int], parts: int) -> np.ndarray:
+        """The entries (*site, part) that weights (weight x part,) stand for; broadcasts to the site's shape."""
+        pair = weights.reshape(-1, parts)
+        along = pair if self.curves is None else self.curves.T @ pair
+        return along.reshape(*(n if i in self.kept else 1 for i, n in enumerate(shape)), parts)
+
+
+@dataclass(frozen=True)
+class Family:
+    """A pattern times a factor.
+
+    Attributes:
+        kind: what is added: "additive", "relative", "conjugate", "from the next <axis>", "location" or "spread".
+        pattern: how its weights vary.
+        factor: by which the weights are multiplied, broadcasting to the site.
+    """
+
+    kind: str
+    pattern: Pattern
+    factor: np.ndarray
+
+    @property
+    def label(self) -> str:
+        """In words."""
+        return f"{self.kind}, {self.pattern.label}"
+
+    def step(self, scores: np.ndarray, variance: np.ndarray, value: np.ndarray) -> np.ndarray:
+        """The perturbation of the site that scores (entry,) point to, of the site's shape and dtype."""
+        floor = 1e-12 * max(float(variance.max(initial=0.0)), 1e-300)
+        weights = np.where(variance > floor, scores / np.where(variance > floor, variance, 1.0), 0.0)
+        parts = self.pattern.perturbation(weights, value.shape, 2 if np.iscomplexobj(value) else 1)
+        step = parts[..., 0] - 1j * parts[..., 1] if np.iscomplexobj(value) else parts[..., 0]
+        return np.broadcast_to(step * self.factor, value.shape)
+
+
+@dataclass(frozen=True)
+class Site:
+    """A site's values at a fit, and the gradients (n, *site) of data and replicates there.
+
+    Attributes:
+        name: the site.
+        axes: its axes.
+        value: at the fit, of the gradients' shape.
+        gradients: of the data and of replicates.
+        kinds: factor of each kind of perturbation.
+        rows: of an observation, its whitened components that move; None for a deterministic site.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    value: np.ndarray
+    gradients: np.ndarray
+    kinds: Mapping[str, np.ndarray]
+    rows: tuple[int, ...] | None = None
+
+    def entries(self, kind: str) -> np.ndarray:
+        """Scores (n, *site, part) of a perturbation of every entry."""
+        entry = self.gradients * self.kinds[kind]
+        return np.stack([np.real(entry), np.imag(entry)], -1) if np.iscomplexobj(entry) else entry[..., None]
+
+    @cached_property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of the site."""
+        return self.gradients.shape[1:]
+
+
+def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients: np.ndarray) -> Site:
+    """A deterministic site of the model; `value` may be smaller than the gradients along axes of size 1."""
+    grown = np.broadcast_to(value, gradients.shape[1:])
+    kinds = {"additive": np.ones(()), "relative": grown}
+    if np.iscomplexobj(grown):
+        kinds["conjugate"] = np.conj(grown)
+        for i, axis in enumerate(axes):
+            if grown.shape[i] > 1:
+                kinds[f"from the next {axis}"] = np.roll(grown, -1, i)
+                kinds[f"from the last {axis}"] = np.roll(grown, 1, i)
+    return Site(name, axes, grown, gradients, kinds)
+
+
+def observed(problem: Problem, rows: jax.Array) -> Iterator[Site]:
+    """Spreads of what is observed, from projected rows (n, cluster, row); locations too where the model names no site."""
+    flat = problem.rows.unstack(np.asarray(rows))
+    start = 0
+    for name, count in problem.components.items():
+        site = problem.declaration.observed[name]
+        shape = (len(flat), count, *site.shape)
+        own = flat[:, start : start + count * site.size].reshape(shape)
+        start += count * site.size
+        located = problem.located[name]
+        complex_parts = 2 if located == 2 < count else 1
+        for kind, moved in (("location", range(complex_parts)), ("spread", range(located, located + 1))):
+            wanted = located < count if kind == "spread" else not problem.float_sites
+            if wanted:
+                part = own[:, moved[0]] if len(moved) == 1 else own[:, moved[0]] - 1j * own[:, moved[1]]
+                value = np.ones(site.shape, part.dtype)
+                yield Site(name, site.axes, value, part, {kind: np.ones(())}, tuple(moved))
+
+
+def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> jax.Array:
+    """Whitened shifts (n, cluster, row) of perturbations (n, *site), to first order."""
+    if site.rows is None:
+        return jnp.moveaxis(problem.compiled.site_shift(x, {site.name: steps}), -1, 0)
+    parts = (np.real(steps), np.imag(steps))
+    found = []
+    for i in range(len(steps)):
+        rows = {
+            n: np.zeros((count, *problem.declaration.sites[n].shape))
+            for n, count in problem.components.items()
+        }
+        for place, part in zip(site.rows, parts, strict=False):
+            rows[site.name][place] = part[i]
+        found.append(problem.rows.stack({n: jnp.asarray(v) for n, v in rows.items()}))
+    return jnp.stack(found)
+
+
+def families(problem: Problem, site: Site) -> Iterator[tuple[Family, np.ndarray]]:
+    """Every family of a site with its scores (1 + replicate, entry), one after another."""
+    patterns = list(_patterns(problem, site))
+    for kind, factor in site.kinds.items():
+        entries = site.entries(kind)
+        for pattern in patterns:
+            yield Family(kind, pattern, factor), pattern.scores(entries)
+
+
+def _patterns(problem: Problem, site: Site) -> Iterator[Pattern]:
+    """Pooled along axes, and along curves on one axis."""
+    for kept in _kept_axes(site.shape):
+        yield Pattern(" x ".join(site.axes[i] for i in kept) or "common", kept)
+    for i, axis in enumerate(site.axes):
+        for label, curve in curves(problem, axis, site.shape[i]).items():
+            yield Pattern(label, (i,), curve)
+
+
+def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:
+    """Axes along which a perturbation varies: none, one, all but one, all."""
+    wide = [i for i, n in enumerate(shape) if n > 1]
+    sizes = sorted({0, 1, len(wide) - 1, len(wide)} & set(range(len(wide) + 1)))
+    for size in sizes:
+        yield from itertools.combinations(wide, size)

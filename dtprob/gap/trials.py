@@ -1,0 +1,133 @@
+"""Refits with one more effect: of which candidates, and which of them is to be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+
+from dtprob.effects.effect import Effect
+from dtprob.gap import fit as fitting
+from dtprob.gap.problem import Problem
+from dtprob.gap.refit import polished, refit, starting_points
+from dtprob.gap.scan import Found, scan
+from dtprob.gap.settings import Settings
+from dtprob.gap.view import View
+
+type Say = Callable[[str], None]
+
+_LARGEST_FIELD: Final = 256
+"""Entries of a field per cluster up to which it is fitted entry by entry."""
+_LARGEST_TANGENTS: Final = 100_000_000
+"""Numbers that the tangents of a field may take: 0.8 GB."""
+_PREFERRED: Final = 0.9
+"""Share of a random field's evidence at which an effect with parameters of its own is preferred."""
+_LARGE_GAP: Final = 100.0
+"""Nats above which first-order scores may miss the effect that matters."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """A fit and the problem whose coordinates it is in."""
+
+    problem: Problem
+    fitted: fitting.Fit
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Refits by the name of the effect that each adds, in a problem in which all of these are live."""
+
+    problem: Problem
+    fits: Mapping[str, fitting.Fit]
+
+
+NOTHING: Final[Mapping[str, Start]] = MappingProxyType({})
+
+
+def tried(seen: View, settings: Settings, say: Say, known: Mapping[str, Start] = NOTHING) -> Trials:
+    """Refits of the most promising candidates beside the effects of a view.
+
+    Args:
+        seen: the fit, and what it calls for.
+        settings: number of refits.
+        say: receives one line for each.
+        known: candidates to refit in any case, by name, with where to start.
+    """
+    screening, fitted = seen.screening, seen.fitted
+    found: dict[str, Found] = {}
+    if not fitted.effects and seen.promise > _LARGE_GAP:
+        say("scanning the effects' plausible sizes")
+        found = scan(seen.problem, seen.fitted.x, screening.names)
+    scanned = np.array([found[n].gain if n in found else -np.inf for n in screening.names])
+    chosen = [name for name in _chosen(seen, scanned, settings) if name not in known]
+    problem = seen.problem.with_live([*fitted.effects, *known, *chosen])
+    start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
+    effects = {e.name: e for e in problem.effects}
+    trials = {
+        name: fitting.fit(
+            problem, problem.translate(at.fitted.x, at.problem), at.fitted.effects, spread=at.fitted.spread
+        )
+        for name, at in known.items()
+    }
+    for name in chosen:
+        say(f"refitting with {name}")
+        starts = starting_points(problem, start.x, effects[name], screening.step.get(name), settings)
+        if name in found:
+            starts.append(_scanned_start(problem, seen.problem, effects[name], found[name]))
+        trials[name] = refit(problem, start, effects[name], starts)
+    return Trials(problem, polished(problem, start, trials, settings.polished))
+
+
+def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:
+    """The refit with the largest evidence, if it outweighs the choice among all candidates and is no minor matter.
+
+    A random field can imitate nearly anything, so an effect with parameters of its own is preferred when it reaches a good
+    part of the evidence; what the field would add on top is left to the next step.
+    """
+    if not trials:
+        return None
+    fitted, kinds = seen.fitted, {e.name: e.kind for e in seen.problem.effects}
+    gain = {name: trial.log_evidence - fitted.log_evidence for name, trial in trials.items()}
+    chosen = max(gain, key=lambda name: gain[name])
+    plain = {name: value for name, value in gain.items() if kinds[name] == "mean"}
+    if plain and max(plain.values()) >= _PREFERRED * gain[chosen]:
+        chosen = max(plain, key=lambda name: plain[name])
+    so_far = fitted.log_evidence - base.log_evidence
+    needed = max(np.log(len(kinds)) + 3.0, settings.minor * so_far)
+    return chosen if gain[chosen] > needed else None
+
+
+def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:
+    x = problem.translate(found.x, scanned)
+    x[problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)] = found.parameters
+    return x
+
+
+def _chosen(seen: View, scanned: np.ndarray, settings: Settings) -> list[str]:
+    """The best candidates by score and, in equal number, by the scan."""
+    screening = seen.screening
+    able = [
+        i
+        for i, name in enumerate(screening.names)
+        if screening.absorbed_by[i] is None and _affordable(seen.problem, name)
+    ]
+    by_score = sorted(
+        (i for i in able if screening.log_bayes_factor[i] > 0), key=lambda i: -screening.log_bayes_factor[i]
+    )
+    by_scan = sorted((i for i in able if scanned[i] > 3.0), key=lambda i: -scanned[i])
+    half = settings.candidates // 2
+    chosen = dict.fromkeys([*by_score[:half], *by_scan[:half], *by_score[half:], *by_scan[half:]])
+    return [screening.names[i] for i in list(chosen)[: settings.candidates]]
+
+
+def _affordable(problem: Problem, name: str) -> bool:
+    """Whether a field is small enough to be fitted entry by entry."""
+    effect = next(e for e in problem.effects if e.name == name)
+    if effect.kind == "mean":
+        return True
+    size = int(np.prod(problem.field_shapes[name], dtype=int)) // problem.n_cluster
+    return size <= _LARGEST_FIELD and size * problem.rows.gather.size <= _LARGEST_TANGENTS

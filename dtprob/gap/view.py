@@ -1,0 +1,47 @@
+"""A fit seen from all sides: what it leaves, which candidates it calls for, where."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import jax
+
+from dtprob.gap import fit as fitting
+from dtprob.gap.bootstrap import replicate
+from dtprob.gap.problem import Problem
+from dtprob.gap.projection import Projection, project
+from dtprob.gap.screen import Screening, screen
+from dtprob.gap.settings import Settings
+from dtprob.gap.where import Location, locate
+
+
+@dataclass(frozen=True)
+class View:
+    """A fit, the scores of all candidates there, and the maps of the gap that it leaves."""
+
+    problem: Problem
+    fitted: fitting.Fit
+    projection: Projection
+    screening: Screening
+    location: Location
+
+    @property
+    def promise(self) -> float:
+        """Nats that the best candidate or site could still bring, to first order."""
+        return max(
+            float(self.screening.log_bayes_factor.max(initial=0.0)),
+            max((s.gain for s in self.location.sites), default=0.0),
+        )
+
+    def alarmed(self, settings: Settings) -> bool:
+        """Whether the effects' scores or the site tests show a gap at the level."""
+        level = settings.level / 2
+        return float(self.screening.adjusted.min(initial=1.0)) <= level or self.location.site_p_value <= level
+
+
+def view(problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settings) -> View:
+    """Screen all candidates and map the gap at a fit, on one bootstrap."""
+    projection = project(problem, fitted)
+    drawn = replicate(problem, fitted, projection, key, settings)
+    screening = screen(problem, fitted, projection, drawn, settings)
+    return View(problem, fitted, projection, screening, locate(problem, fitted, projection, drawn))

@@ -1,0 +1,72 @@
+"""The search takes back a first choice that was made for two effects at once, and finds what no listed effect explains."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects import Effect, Parameter
+from dtprob.gap.base import fit_base
+from dtprob.gap.problem import Problem
+from dtprob.gap.search import search
+from dtprob.gap.settings import Settings
+
+LENGTH = 480
+SETTINGS = Settings(replicates=200, candidates=3)
+
+
+def table(x, street, y=None):
+    """A constant level with unknown noise over rows that lie in streets."""
+    del street
+    level = numpyro.sample("level", dist.Normal(0.0, 3.0))
+    noise = numpyro.sample("noise", dist.LogNormal(0.0, 0.5))
+    with numpyro.plate("row", len(x)):
+        mean = numpyro.deterministic("mean", level + 0.0 * x)
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+
+def wave(name, *parts):
+    """An effect that adds its size times a sum of sines of x."""
+
+    def rewrite(value, p, context):
+        return value + p["c"] * sum(a * jnp.sin(f * context["x"]) for a, f in parts)
+
+    return Effect(name, {"mean": rewrite}, (Parameter("c", dist.Normal(0.0, 1.0)),))
+
+
+EFFECTS = (wave("one", (1.0, 3.0)), wave("two", (1.0, 5.0)), wave("both", (1.0, 3.0), (1.0, 5.0), (0.5, 9.0)))
+
+
+def rows(seed, shift=lambda x: 0.0 * x, spread=lambda street: 1.0 + 0.0 * street):
+    rng = np.random.default_rng((seed, 5))
+    x, street = rng.uniform(-np.pi, np.pi, LENGTH), rng.integers(0, 24, LENGTH)
+    y = 1.0 + shift(x) + spread(street) * rng.normal(size=LENGTH)
+    return {"x": jnp.asarray(x), "street": jnp.asarray(street), "y": jnp.asarray(y)}
+
+
+def look(data, seed):
+    """The steps of a search."""
+    problem, key = Problem(table, data, EFFECTS, "street"), jax.random.key(seed)
+    return search(problem, fit_base(problem, key), key, SETTINGS, print)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_first_choice_made_for_two_effects_is_taken_back(seed):
+    steps = look(rows(seed, shift=lambda x: 0.9 * np.sin(3 * x) + 0.6 * np.sin(5 * x)), seed)
+    assert steps[0].accepted == "both"
+    assert set(steps[-1].view.fitted.effects) == {"one", "two"}
+
+
+def test_noise_that_differs_by_a_column_is_noticed():
+    steps = look(rows(3, spread=lambda street: np.where(street < 4, 2.0, 1.0)), 3)
+    assert steps[-1].view.fitted.effects == ()
+    best = steps[-1].view.location.sites[0]
+    assert (best.site, best.family) == ("y", "spread, by street")
+    assert best.p_value < 1e-4
+
+
+def test_nothing_is_found_where_there_is_nothing():
+    """Four diagnoses at a level of 1%: one alarm has probability .04, two .0006."""
+    assert sum(look(rows(10 + s), s)[0].view.alarmed(SETTINGS) for s in range(4)) <= 1

@@ -1,0 +1,121 @@
+"""Site families: patterns are linear and their scores adjoint to what they perturb; curves are what their labels say."""
+
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.gap.curves import curves
+from dtprob.gap.families import deterministic, families, observed, shifted
+from dtprob.gap.problem import Problem
+from tests.unit.gap.examples import bend, draw, line
+
+LENGTH = 40
+
+
+def table(x, street, place, y=None):
+    """A line over rows that lie in streets, at places."""
+    del street, place
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("row", len(x)):
+        mean = numpyro.deterministic("mean", slope * x)
+        numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+def raw(x, y=None):
+    """A line that names no site."""
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(slope * x, 1.0), obs=y)
+
+
+def rows(seed=1):
+    rng = np.random.default_rng(seed)
+    return {
+        "x": jnp.asarray(rng.normal(size=LENGTH)),
+        "street": jnp.asarray(np.repeat(np.arange(5), 8)[rng.permutation(LENGTH)]),
+        "place": jnp.asarray(rng.normal(size=(LENGTH, 2))),
+        "y": jnp.asarray(rng.normal(size=LENGTH)),
+    }
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return Problem(table, rows(), [bend()], "row")
+
+
+def complex_site(problem, shape=(LENGTH, 3), axes=("row", "antenna")):
+    rng = np.random.default_rng(3)
+    value = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    gradients = rng.normal(size=(4, *shape)) + 1j * rng.normal(size=(4, *shape))
+    return deterministic("gain", axes, value, gradients)
+
+
+def test_scores_are_the_slope_along_what_a_family_perturbs(problem):
+    site = complex_site(problem)
+    seen = set()
+    for family, scores in families(problem, site):
+        step = family.step(scores[0], np.ones(scores.shape[1]), site.value)
+        slope = np.real(np.sum(site.gradients * step, axis=(1, 2)))  # d = Re(g dz), as JAX has it
+        np.testing.assert_allclose(slope, scores @ scores[0], rtol=1e-6, atol=1e-9)
+        seen.add(family.kind)
+    assert seen == {
+        "additive",
+        "relative",
+        "conjugate",
+        *(f"from the {side} {axis}" for side in ("next", "last") for axis in ("row", "antenna")),
+    }
+
+
+def test_a_neighbour_leaks_into_an_entry(problem):
+    site = complex_site(problem)
+    found = {family.label: family for family, _ in families(problem, site)}
+    step = found["from the next antenna, common"].step(np.array([1.0, 0.0]), np.ones(2), site.value)
+    np.testing.assert_allclose(step, np.roll(site.value, -1, axis=1))
+
+
+def test_curves_are_smooth_ripples_columns_and_groups(problem):
+    found = curves(problem, "row", LENGTH)
+    ripples = [name for name in found if name.startswith("ripple")]
+    waves = np.concatenate([found["smooth in row"].toarray(), *(found[n].toarray() for n in ripples)])
+    np.testing.assert_allclose(waves @ waves.T, LENGTH / 2 * np.eye(LENGTH - 1), atol=1e-9)
+    assert found["by street"].shape == (5, LENGTH)
+    np.testing.assert_array_equal(found["by street"].toarray().sum(0), 1.0)
+    assert {"along x", "along place[0]", "along place[1]", "over place[0] and place[1]"} <= set(found)
+    assert not any("y" in name.split()[1:] for name in found)
+    order = np.argsort(np.asarray(problem.data["x"]))
+    assert np.all(np.diff(found["along x"].toarray()[0][order]) < 0)
+
+
+def test_short_axes_have_no_curves(problem):
+    assert curves(problem, "antenna", 5) == {}
+
+
+def test_the_spread_of_an_observation_is_a_site(problem):
+    x = problem.null()
+    sites = list(observed(problem, problem.compiled.residual(x)[None]))
+    assert [(s.name, list(s.kinds)) for s in sites] == [("y", ["spread"])]
+    y = np.asarray(problem.data["y"])
+    np.testing.assert_allclose(sites[0].gradients[0], (y**2 - 1) / np.sqrt(2), rtol=1e-5)
+    step = np.random.default_rng(0).normal(size=(1, LENGTH))
+    moved = problem.rows.unstack(np.asarray(shifted(problem, x, sites[0], step)))
+    np.testing.assert_allclose(moved[0], np.concatenate([np.zeros(LENGTH), step[0]]), rtol=1e-6)
+
+
+def test_where_no_site_is_named_the_observations_locations_are_tested():
+    problem = Problem(raw, {n: rows()[n] for n in ("x", "y")}, [], "row")
+    sites = list(observed(problem, problem.compiled.residual(problem.null())[None]))
+    assert [list(s.kinds) for s in sites] == [["location"], ["spread"]]
+    y = np.asarray(problem.data["y"])
+    np.testing.assert_allclose(sites[0].gradients[0], y, rtol=1e-5)
+
+
+def test_rows_go_back_to_where_they_were_observed():
+    problem = Problem(line, draw("line"), [bend()])
+    flat = np.arange(2.0 * 12 * 8)
+    values = {"y": jnp.asarray(flat.reshape(2, 12, 8))}
+    np.testing.assert_array_equal(problem.rows.unstack(np.asarray(problem.rows.stack(values))), flat)
+    assert SimpleNamespace(**problem.located).y == 1
