@@ -12,13 +12,8 @@ of its data: there the data come from a population whose parameters are known.
 """
 
 import argparse
-import datetime as dt
 import itertools
-import json
-import platform
 import time
-from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 from dtprob.xla import avoid_miscompilation
@@ -27,13 +22,13 @@ avoid_miscompilation()  # before jax is imported
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
+from record import record, recorded  # noqa: E402
 
 from dtprob.errors import InputError  # noqa: E402
 from dtprob.inference import resolve  # noqa: E402
 from dtprob.testing.calibration import DRAWS, judge, simulated_ranks  # noqa: E402
 from dtprob.testing.calibration_cases import CASES  # noqa: E402
 
-FILE = Path(__file__).parent / "results" / "calibration.json"
 BLOCK = 20
 CHAIN = {"warmup": 300, "draws": 10 * DRAWS, "chains": 1}
 SETTINGS: dict[str, dict[str, Any]] = {
@@ -43,6 +38,7 @@ SETTINGS: dict[str, dict[str, Any]] = {
     "ensemble": {"members": DRAWS, "starts": 2},
     "nuts": CHAIN,
     "blackjax_nuts": CHAIN,
+    "hmc": CHAIN,
     "svi": {"draws": DRAWS, "starts": 2},
     "smc": {"draws": 10 * DRAWS, "chains": 1},
 }
@@ -56,7 +52,7 @@ def main() -> None:
     options = arguments()
     jax.config.update("jax_enable_x64", True)
     end = time.monotonic() + options.seconds
-    kept = json.loads(FILE.read_text()) if FILE.is_file() else {}
+    kept = recorded("calibration")
     counts: Counts = kept.get("counts", {}) if options.write or options.table else {}
     refused: dict[str, dict[str, str]] = kept.get("refused", {})
     for engine, case in () if options.table else itertools.product(options.engine, options.case):
@@ -68,7 +64,7 @@ def main() -> None:
             refused.setdefault(engine, {})[case] = str(error)
         if options.write:
             write({name: found for name, found in counts.items() if any(found.values())}, refused)
-    table(counts)
+    table(counts, refused)
 
 
 def arguments() -> argparse.Namespace:
@@ -101,12 +97,13 @@ def continued(counts: dict[str, list[int]], engine: str, case: str, runs: int, e
     )
 
 
-def table(counts: Counts) -> None:
-    """A line per engine and model: coverage, least and most over unknowns, and p-values for all of them together."""
-    for engine, cases in counts.items():
-        for case, sites in cases.items():
-            if not sites:
-                continue
+def table(counts: Counts, refused: dict[str, dict[str, str]]) -> None:
+    """A line per model and engine: coverage, least and most over unknowns, and p-values for all of them together."""
+    for case, engine in itertools.product(MODELS, SETTINGS):
+        sites = counts.get(engine, {}).get(case, {})
+        if case in refused.get(engine, {}):
+            print(f"| `{engine}` | {case} | refused | | | |")
+        if sites:
             verdicts = {name: judge(np.repeat(np.arange(DRAWS + 1), c)) for name, c in sites.items()}
             coverage = {name: verdict.coverage for name, verdict in verdicts.items()}
             low, high = min(coverage, key=coverage.__getitem__), max(coverage, key=coverage.__getitem__)
@@ -126,26 +123,11 @@ def _p(value: float) -> str:
 
 
 def write(counts: Counts, refused: dict[str, dict[str, str]]) -> None:
-    """Keep the counts with what it takes to repeat them."""
-    result = {
-        "benchmark": "simulation-based calibration: how often each rank of the true value among 19 draws occurred",
-        "command": "python benchmarks/calibration.py --write",
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "numpyro", "blackjax")},
-        "settings": SETTINGS,
-        "refused": refused,
-        "counts": counts,
-    }
-    text = json.dumps(result, indent=1)
-    FILE.write_text(_short_lists(text) + "\n")
-
-
-def _short_lists(text: str) -> str:
-    """The JSON with each list of numbers on one line."""
-    parts = text.split("[")
-    lists = [part.split("]", 1) for part in parts[1:]]
-    return parts[0] + "".join(f"[{' '.join(inside.split())}]{rest}" for inside, rest in lists)
+    """Keep the counts."""
+    what = "simulation-based calibration: how often each rank of the true value among 19 draws occurred"
+    figures = {"settings": SETTINGS, "refused": refused, "counts": counts}
+    command = "python benchmarks/calibration.py --write"
+    record("calibration", what, ("jax", "numpyro", "blackjax"), figures, command=command)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.ensemble import Ensemble
 from dtprob.inference.exact import Exact
 from dtprob.inference.fit import ENGINES, fit, resolve
+from dtprob.inference.hmc import HMC
 from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
 from dtprob.inference.point import Point
@@ -22,6 +23,7 @@ from dtprob.inference.von_mises_em import VonMisesEM
 
 __all__ = [
     "ENGINES",
+    "HMC",
     "NUTS",
     "SMC",
     "SVI",

@@ -1,144 +1,52 @@
-"""The No-U-Turn sampler of BlackJAX, whose mass matrix is learned from draws and gradients.
+"""The No-U-Turn sampler of BlackJAX; for its adaptation see `dtprob.inference.blackjax_kernel`.
 
-The diagonal is sqrt(var(draws) / var(gradients)), which minimises the Fisher divergence between the posterior and
-the normal distribution that the metric stands for, and needs fewer draws than a variance; windows are short at first
-and then grow. Source: Cabezas et al., BlackJAX: composable Bayesian inference in JAX (2024); Seyboldt et al.,
-Preconditioning Hamiltonian Monte Carlo by minimizing Fisher divergence (2026), as in nutpie.
+Source: Cabezas et al., BlackJAX: composable Bayesian inference in JAX (2024).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar
 
-import jax
-import jax.numpy as jnp
-from blackjax.adaptation.low_rank_adaptation import build_growing_window_schedule
-from blackjax.adaptation.metric_recipes import REGISTRY, MetricCore
-from blackjax.adaptation.step_size import dual_averaging_adaptation
 from blackjax.mcmc import nuts
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, PRNGKeyArray
 
-from dtprob.inference.kernel import Place, Stats, lifted_log_density
-from dtprob.inference.no_u_turn import AbstractNoUTurn
-from dtprob.inference.target import Target
-
-
-class ChainState(NamedTuple):
-    """A chain's position and what has been adapted."""
-
-    chain: Any  # blackjax.mcmc.hmc.HMCState, whose annotations are not those of arrays
-    step_size: Array
-    averaging: Any
-    mass: Any
+from dtprob.inference.blackjax_kernel import BlackJAXKernel
+from dtprob.inference.hamiltonian import AbstractHamiltonian
 
 
 @dataclass(frozen=True)
-class BlackJAXKernel:
-    """BlackJAX's transition and adaptation; see `dtprob.inference.kernel.Kernel`."""
+class NoUTurn:
+    """A trajectory that doubles until it turns back; see `dtprob.inference.blackjax_kernel.Trajectory`."""
 
-    warmup: int
-    target_accept: float
     max_tree_depth: int
-    dense_mass: bool
 
-    def init(self, target: Target, key: PRNGKeyArray, position: Array, place: Place) -> ChainState:
-        """State of a chain that starts at a position."""
-        del key
-        one = jnp.ones((), position.dtype)
-        averaging = dual_averaging_adaptation(self.target_accept)[0](one)
-        chain = nuts.init(position, _density(target, place))
-        state = ChainState(
-            chain, one, averaging, self._metric(jnp.asarray(chain.logdensity_grad)).init(target.dimension)
-        )
-        return jax.tree.map(lambda x: jnp.asarray(x, jnp.result_type(x)), state)
-
-    def step(
-        self, target: Target, key: PRNGKeyArray, state: ChainState, index: Array, place: Place
-    ) -> tuple[ChainState, Stats]:
+    def __call__(  # noqa: PLR0917
+        self,
+        key: PRNGKeyArray,
+        chain: Any,
+        density: Callable[[Array], Array],
+        step_size: Array,
+        inverse_mass: Array,
+        index: Array,
+    ) -> tuple[Any, Any, Array]:
         """One transition."""
+        del index
         transition: Callable[..., tuple[Any, Any]] = nuts.build_kernel()
-        moved, info = transition(
-            key,
-            state.chain,
-            _density(target, place),
-            state.step_size,
-            state.mass.inverse_mass_matrix,
-            self.max_tree_depth,
-        )
-        stats = Stats(
-            moved.logdensity,
-            info.is_divergent,
-            info.energy,
-            info.num_trajectory_expansions,
-            info.acceptance_rate,
-            state.step_size,
-        )
-        state = state._replace(chain=moved)
-        if self.warmup == 0:
-            return state, stats
-        adapted = jax.lax.cond(
-            index < self.warmup, self._adapt, lambda s, *_: s, state, info.acceptance_rate, index
-        )
-        return adapted, stats
-
-    def position(self, state: ChainState) -> Float[Array, " dimension"]:
-        """Where the chain is."""
-        return state.chain.position
-
-    def shift(self, state: ChainState, position: Array, log_density: Array, gradient: Array) -> ChainState:
-        """The state at another position."""
-        chain = state.chain
-        return state._replace(
-            chain=chain._replace(
-                position=position,
-                logdensity=chain.logdensity + log_density,
-                logdensity_grad=chain.logdensity_grad + gradient,
-            )
-        )
-
-    def _metric(self, slope: Array | None = None) -> MetricCore:
-        """How the inverse mass matrix is learned; a diagonal one begins at one over the size of the slope."""
-        if self.dense_mass:
-            return REGISTRY["welford_dense"].build_core()
-        if slope is None:
-            return REGISTRY["fisher_diag"].build_core()
-        size = jnp.abs(slope)
-        scale = jnp.where(jnp.isfinite(size) & (size > 1.0), 1 / size, 1.0)
-        return REGISTRY["fisher_diag"].build_core(initial_inverse_mass_matrix=scale)
-
-    def _adapt(self, state: ChainState, acceptance_rate: Array, index: Array) -> ChainState:
-        restart, update, average = dual_averaging_adaptation(self.target_accept)
-        metric = self._metric()
-        is_slow, ends_window = jnp.asarray(build_growing_window_schedule(self.warmup))[index]
-        averaging = update(state.averaging, acceptance_rate)
-        chain = state.chain
-        mass = jax.lax.cond(
-            is_slow == 1,
-            lambda: metric.update(state.mass, chain.position, chain.logdensity_grad),
-            lambda: state.mass,
-        )
-
-        def close() -> tuple[Any, Any]:
-            return restart(average(averaging)), metric.final(mass)
-
-        averaging, mass = jax.lax.cond(ends_window == 1, close, lambda: (averaging, mass))
-        is_last = index == self.warmup - 1
-        step_size = jnp.where(is_last, average(averaging), jnp.exp(averaging.log_step_size))
-        return ChainState(state.chain, step_size, averaging, mass)
-
-
-def _density(target: Target, place: Place) -> Callable[[Array], Array]:
-    return lambda u: lifted_log_density(target, u, place)
+        moved, info = transition(key, chain, density, step_size, inverse_mass, self.max_tree_depth)
+        return moved, info, info.num_trajectory_expansions
 
 
 @dataclass(frozen=True)
-class BlackJAXNUTS(AbstractNoUTurn):
+class BlackJAXNUTS(AbstractHamiltonian):
     """The No-U-Turn sampler of BlackJAX; promises and settings are those of `nuts`."""
 
     name: ClassVar[str] = "blackjax_nuts"
+    least: ClassVar[Mapping[str, int]] = {"max_tree_depth": 1}
+
+    max_tree_depth: int = 10
 
     def kernel(self, warmup: int) -> BlackJAXKernel:
         """BlackJAX's transition."""
-        return BlackJAXKernel(warmup, self.target_accept, self.max_tree_depth, self.dense_mass)
+        return BlackJAXKernel(NoUTurn(self.max_tree_depth), warmup, self.target_accept, self.dense_mass)

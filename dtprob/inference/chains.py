@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dtprob.inference.kernel import Kernel, Place, window_of
+from dtprob.inference.kernel import STATS_TYPES, Kernel, Place, window_of
 from dtprob.inference.target import Inputs, Target
 from dtprob.inference.winding import recentred, redraw_winding
 
@@ -27,7 +27,7 @@ class Walk:
     Attributes:
         kernel: the transition.
         method: "parallel" where each chain has calls of its own, "vectorized" where all are in one program.
-        explore: steps before the angles' windows are centred; 0 without angles.
+        explore: steps after which the angles' windows are centred; 0 without angles.
         warmup: steps in all that are not kept.
         own: the arrays of the data of which each chain has its own, stacked on a leading axis, and then also its own
             units; none where all chains are of one posterior. Such chains run side by side.
@@ -87,18 +87,6 @@ def start(
     return walk.over_chains(one, inputs, points, keys)
 
 
-def recentre(target: Target, walk: Walk, chains: Chain, inputs: Inputs) -> Chain:
-    """The chains with windows centred on their mean directions so far; what is adapted stays."""
-
-    def one(_: Inputs, chain: Chain) -> Chain:
-        centre = jnp.arctan2(chain.resultant[:, 1], chain.resultant[:, 0])
-        point = walk.kernel.position(chain.kernel)
-        point = point.at[target.angles].set(recentred(point[target.angles], centre))
-        return _shifted(target, walk, chain, point, centre)
-
-    return walk.over_chains(one, inputs, chains)
-
-
 def advance(  # noqa: PLR0917  (settings first, since they are bound before compilation)
     target: Target,
     walk: Walk,
@@ -119,10 +107,11 @@ def advance(  # noqa: PLR0917  (settings first, since they are bound before comp
     def one(inputs: Inputs, chain: Chain, key: PRNGKeyArray) -> tuple[Chain, dict[str, Array]]:
         def body(number: Array, carry: tuple[Chain, dict[str, Array]]) -> tuple[Chain, dict[str, Array]]:
             moved, row = _step(target, walk, carry[0], jax.random.fold_in(key, number), number, inputs)
-            return moved, jax.tree.map(lambda block, x: block.at[number - begin].set(x), carry[1], row)
+            blocks = jax.tree.map(lambda block, x: block.at[number - begin].set(x), carry[1], row)
+            return moved, blocks
 
-        row = jax.eval_shape(lambda: _step(target, walk, chain, key, begin, inputs)[1])
-        empty = jax.tree.map(lambda x: jnp.zeros((rows, *x.shape), x.dtype), row)
+        empty = {name: jnp.zeros(rows, kind) for name, kind in STATS_TYPES.items()}
+        empty["position"] = jnp.zeros((rows, target.dimension))
         return jax.lax.fori_loop(begin, end, body, (chain, empty))
 
     return walk.over_chains(one, inputs, chains, jax.vmap(jax.random.fold_in, (0, None))(keys, STEP))
@@ -138,19 +127,23 @@ def _step(  # noqa: PLR0917
     stats = stats._replace(lp=stats.lp - window)
     if target.angles.size:
         chain = _turn(target, walk, chain, winding_key, number)
-    return chain, {"position": walk.kernel.position(chain.kernel), **stats._asdict()}
+    row = {name: jnp.asarray(value, STATS_TYPES[name]) for name, value in stats._asdict().items()}
+    return chain, row | {"position": walk.kernel.position(chain.kernel)}
 
 
 def _turn(target: Target, walk: Walk, chain: Chain, key: PRNGKeyArray, number: Array) -> Chain:
-    """Follow the angles while exploring; redraw their winding numbers once draws are kept."""
+    """Follow the angles while exploring, and centre their windows at the end; redraw winding numbers of draws."""
     before = walk.kernel.position(chain.kernel)
     angles = before[target.angles]
     follows = (number >= walk.explore // 2) & (number < walk.explore)
-    direction = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
-    chain = chain._replace(resultant=chain.resultant + follows * direction)
-    after = before.at[target.angles].set(redraw_winding(key, angles, chain.centre))
-    after = jnp.where(number >= walk.warmup, after, before)
-    return _shifted(target, walk, chain, after, chain.centre)
+    resultant = chain.resultant + follows * jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+    is_explored = number == walk.explore - 1
+    mean = jnp.arctan2(resultant[:, 1], resultant[:, 0])
+    centre = jnp.where(is_explored, mean, chain.centre)
+    settled = jnp.where(is_explored, recentred(angles, mean), angles)
+    turned = jnp.where(number >= walk.warmup, redraw_winding(key, angles, chain.centre), settled)
+    chain = chain._replace(resultant=resultant)
+    return _shifted(target, walk, chain, before.at[target.angles].set(turned), centre)
 
 
 def _shifted(target: Target, walk: Walk, chain: Chain, point: Array, centre: Array) -> Chain:

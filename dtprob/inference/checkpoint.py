@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import time
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple, cast
 
@@ -15,6 +17,9 @@ from dtprob.errors import InputError
 from dtprob.files import atomic_write
 
 FORMAT = "dtprob checkpoint 1"
+SAVE_EVERY = 1.0
+"""Seconds between two checkpoints, at least: a step may take a thousandth of that."""
+_SAVE_SHARE = 20
 
 
 class Snapshot(NamedTuple):
@@ -29,6 +34,25 @@ class Snapshot(NamedTuple):
     done: int
     state: list[np.ndarray]
     draws: dict[str, np.ndarray]
+
+
+@dataclass
+class Pace:
+    """When to save: at most once in `SAVE_EVERY` seconds, and for at most a twentieth of the time."""
+
+    _ended: float = field(default_factory=time.monotonic)
+    _took: float = 0.0
+
+    def is_due(self) -> bool:
+        """Whether it is time to save."""
+        return time.monotonic() - self._ended >= max(SAVE_EVERY, _SAVE_SHARE * self._took)
+
+    def write(self, path: Path, identity: Mapping[str, Any], snapshot: Snapshot) -> None:
+        """Save; see `write`."""
+        begin = time.monotonic()
+        write(path, identity, snapshot)
+        self._ended = time.monotonic()
+        self._took = self._ended - begin
 
 
 def write(path: Path, identity: Mapping[str, Any], snapshot: Snapshot) -> None:

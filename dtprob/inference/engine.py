@@ -25,10 +25,12 @@ class RunOptions:
     Attributes:
         progress: tell the progress on standard error, as a bar on a terminal and as plain lines elsewhere.
         status_file: a JSON file that always holds the latest progress.
-        checkpoint: a file that holds the state of the run, replaced after every chunk; kept by the engines
-            that draw chains, while the others finish in one piece.
+        checkpoint: a file that holds the state of the run, replaced after a chunk of draws or a step, at most once
+            a second and for at most a twentieth of the time; kept by the engines that iterate, while the others
+            finish in one piece.
         resume: continue from `checkpoint` where it exists.
-        chunk: draws between two checkpoints or progress reports.
+        chunk: steps of Markov chains between two checkpoints or progress reports; by default 100, and more where
+            these take less than half a second.
         deterministics: keep the model's deterministic sites among the draws.
         pointwise: keep the log likelihood of every observation for every draw.
         max_entries: a deterministic site or log likelihood with more entries than this over all draws is left
@@ -39,14 +41,14 @@ class RunOptions:
     status_file: Path | None = None
     checkpoint: Path | None = None
     resume: bool = False
-    chunk: int = 100
+    chunk: int | None = None
     deterministics: bool = True
     pointwise: bool = True
     max_entries: int = 20_000_000
 
     def __post_init__(self) -> None:
         """Refuse settings that cannot work."""
-        if self.chunk < 1:
+        if self.chunk is not None and self.chunk < 1:
             raise InputError("chunk of a run", "1 or more draws", str(self.chunk), "Give a positive number")
         if self.resume and self.checkpoint is None:
             raise InputError("resume", "a checkpoint file", "none", "Give the file of the interrupted run")

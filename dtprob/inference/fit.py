@@ -14,6 +14,7 @@ from dtprob.inference.blackjax_nuts import BlackJAXNUTS
 from dtprob.inference.engine import DEFAULT, AbstractEngine, RunOptions
 from dtprob.inference.ensemble import Ensemble
 from dtprob.inference.exact import Exact
+from dtprob.inference.hmc import HMC
 from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
 from dtprob.inference.point import Point
@@ -29,6 +30,7 @@ ENGINES: Mapping[str, type[AbstractEngine]] = {
         Auto,
         NUTS,
         BlackJAXNUTS,
+        HMC,
         SMC,
         SVI,
         VonMisesEM,

@@ -5,7 +5,6 @@ Markov chains have a loop of their own (`dtprob.inference.run`), since they keep
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,9 +18,6 @@ from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.identity import identity
 from dtprob.inference.progress import Progress
 from dtprob.inference.target import Inputs, Target
-
-SAVE_EVERY = 1.0
-"""Seconds between two checkpoints, at least: a step may take a thousandth of that."""
 
 type History = dict[str, np.ndarray]
 
@@ -79,19 +75,16 @@ def iterate[S](job: Job, steps: Steps[S]) -> tuple[S, History]:
         identity(job.target, job.inputs, job.engine, job.key, free=job.free) if options.checkpoint else {}
     )
     done, state, rows = _begin(job, steps, wanted)
-    saved = time.monotonic()
+    pace = checkpoint.Pace()
     with Progress(job.engine.name, steps.most, options.progress, options.status_file) as progress:
         while done < steps.most and not steps.finished(state):
             state, row = steps.step(done, state)
             rows.append({name: np.asarray(value)[None] for name, value in row.items()})
             done += 1
             last = done == steps.most or steps.finished(state)
-            if options.checkpoint and (last or time.monotonic() - saved >= SAVE_EVERY):
+            if options.checkpoint and (last or pace.is_due()):
                 leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(state)]
-                checkpoint.write(
-                    options.checkpoint, wanted, checkpoint.Snapshot(done, leaves, _history(rows))
-                )
-                saved = time.monotonic()
+                pace.write(options.checkpoint, wanted, checkpoint.Snapshot(done, leaves, _history(rows)))
             progress.report(done, steps.phase, steps.note(state))
     return state, _history(rows)
 

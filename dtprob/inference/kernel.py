@@ -43,6 +43,10 @@ class Stats(NamedTuple):
     step_size: Array
 
 
+STATS_TYPES = dict.fromkeys(Stats._fields, float) | {"diverging": bool, "tree_depth": int}
+"""What each statistic is kept as."""
+
+
 class Kernel(Protocol):
     """A Markov chain kernel as pure functions of one chain; the run loop maps them over chains.
 

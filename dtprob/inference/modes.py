@@ -129,16 +129,26 @@ def starting_points(
         values: constrained values of the sites that are given.
         starts: how many.
     """
-    first = target.once(Target.prior_median)(inputs, values)[None]
     if starts == 1:
-        return first
-    drawn = target.once(Target.prior_draws)(key, inputs, values)[: _CANDIDATES * (starts - 1)]
-    heights = target.once(_heights, objective)(drawn, inputs)
-    return jnp.concatenate([first, drawn[jnp.argsort(heights)[: starts - 1]]])
+        return target.once(_median)(inputs, values)
+    drawn = target.once(Target.prior_draws)(key, inputs, values)
+    return target.once(_chosen, objective, starts)(drawn, inputs, values)
 
 
-def _heights(
-    target: Target, objective: Objective, points: Float[Array, "point dimension"], inputs: Inputs
-) -> Float[Array, " point"]:
+def _median(target: Target, inputs: Inputs, values: Mapping[str, Array]) -> Float[Array, "1 dimension"]:
+    return target.prior_median(inputs, values)[None]
+
+
+def _chosen(  # noqa: PLR0917
+    target: Target,
+    objective: Objective,
+    starts: int,
+    drawn: Float[Array, "draw dimension"],
+    inputs: Inputs,
+    values: Mapping[str, Array],
+) -> Float[Array, "start dimension"]:
+    """The prior's median, and the best of some prior draws."""
+    points = drawn[: _CANDIDATES * (starts - 1)]
     heights = jax.lax.map(lambda u: objective_value(target, objective, u, inputs), points)
-    return jnp.where(jnp.isfinite(heights), heights, jnp.inf)
+    order = jnp.argsort(jnp.where(jnp.isfinite(heights), heights, jnp.inf))
+    return jnp.concatenate([_median(target, inputs, values), points[order[: starts - 1]]])

@@ -7,7 +7,7 @@ flexible and accelerated probabilistic programming in NumPyro (2019).
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -16,8 +16,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro.infer.hmc import HMCState, hmc
 
+from dtprob.inference.hamiltonian import AbstractHamiltonian
 from dtprob.inference.kernel import Place, Stats, lifted_log_density
-from dtprob.inference.no_u_turn import AbstractNoUTurn
 from dtprob.inference.target import Target
 
 
@@ -40,7 +40,7 @@ class NumPyroKernel:
         """One transition; NumPyro counts the steps in its own state."""
         del index
         start, step = self._functions(target)
-        jax.eval_shape(functools.partial(start, place=place, key=key), state.z)  # binds the warm-up's length
+        jax.eval_shape(functools.partial(start, place=None, key=key), state.z)  # binds the warm-up's length
         moved: HMCState = step(state._replace(rng_key=key), model_args=(place,))
         depth = jnp.floor(jnp.log2(jnp.maximum(moved.num_steps, 1))).astype(int) + 1
         lp = -jnp.asarray(moved.potential_energy)
@@ -62,12 +62,14 @@ class NumPyroKernel:
         )
 
     def _functions(self, target: Target) -> tuple[Callable[..., HMCState], Callable[..., HMCState]]:
-        def potential_for(place: Place) -> Callable[[Array], Array]:
+        def potential_for(place: Place | None) -> Callable[[Array], Array]:
+            if place is None:  # where the value does not matter: nothing of the model is traced
+                return jnp.sum
             return lambda u: -lifted_log_density(target, u, place)
 
         init, step = hmc(potential_fn_gen=potential_for, algo="NUTS")
 
-        def start(position: Array, *, place: Place, key: PRNGKeyArray) -> HMCState:
+        def start(position: Array, *, place: Place | None, key: PRNGKeyArray) -> HMCState:
             return init(
                 position,
                 num_warmup=self.warmup,
@@ -86,13 +88,17 @@ def _without_keys(state: HMCState) -> HMCState:
 
 
 @dataclass(frozen=True)
-class NUTS(AbstractNoUTurn):
+class NUTS(AbstractHamiltonian):
     """The No-U-Turn sampler of NumPyro, exact in the limit of many draws.
 
-    The settings are those of `dtprob.inference.no_u_turn.AbstractNoUTurn`.
+    Attributes:
+        max_tree_depth: bound on the doublings of a trajectory.
     """
 
     name: ClassVar[str] = "nuts"
+    least: ClassVar[Mapping[str, int]] = {"max_tree_depth": 1}
+
+    max_tree_depth: int = 10
 
     def kernel(self, warmup: int) -> NumPyroKernel:
         """NumPyro's transition."""

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import functools
 import os
+import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -24,8 +25,8 @@ from dtprob.errors import InputError
 from dtprob.inference import checkpoint
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
-from dtprob.inference.chains import START, Chain, ChainMethod, Walk, advance, recentre, start
-from dtprob.inference.engine import AbstractEngine, RunOptions, check_counts, check_key
+from dtprob.inference.chains import START, Chain, ChainMethod, Walk, advance, start
+from dtprob.inference.engine import AbstractEngine, RunOptions, check_key
 from dtprob.inference.enough import LOOK_EVERY, NEVER, Enough
 from dtprob.inference.identity import identity
 from dtprob.inference.kernel import Kernel
@@ -35,10 +36,16 @@ from dtprob.inference.progress import Progress
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model
 
-COUNTS = {"chains": 1, "warmup": 0, "draws": 1, "max_tree_depth": 1}
-"""The least that settings of a chain engine can be."""
 _EXPLORE_SHARE = 5
-_ROWS = 100  # steps per call of the compiled function, whatever the chunk
+_ROWS, _ENTRIES = (
+    500,
+    4_000_000,
+)  # steps per call of the compiled function, and numbers of their positions, at most
+_CHUNK, _MOST, _SOON = (
+    100,
+    1000,
+    0.5,
+)  # steps of the first chunk and of the longest one, and seconds to double it
 
 
 @dataclass(frozen=True)
@@ -97,7 +104,6 @@ def run_chains(
     Raises:
         InputError: see `build_target`; or the checkpoint is another run's.
     """
-    check_counts(engine, COUNTS)
     check_key(key)
     target, inputs = build_target(model, data)
     walk = schedule.walk(target, kernel_for)
@@ -138,25 +144,38 @@ class Loop:
         wanted = self._wanted() if self.options.checkpoint else {}
         key_groups = self._grouped(keys)
         done, groups, kept = self._begin(key_groups, wanted)
-        total, move = self.schedule.total, self._compiled(advance, _ROWS)
+        rows = self._rows(len(key_groups[0]))
+        move = self.target.compiled(advance, self.walk, rows)
         move(groups[0], key_groups[0], done, done, self.inputs)  # no step: compiled before threads ask for it
+        total, length, pace = self.schedule.total, self.options.chunk or _CHUNK, checkpoint.Pace()
+        diverging = sum(int(block["diverging"].sum()) for block in kept)
+        finished = done == total or self._is_enough(done, kept)
         with (
             ThreadPoolExecutor(min(len(groups), os.cpu_count() or 1)) as pool,
             Progress(self.engine.name, total, self.options.progress, self.options.status_file) as progress,
         ):
-            while done < total and not self._is_enough(done, kept):
-                if done == self.walk.explore > 0:
-                    groups = [self.target.once(recentre, self.walk)(group, self.inputs) for group in groups]
-                end = self._chunk_end(done)
-                advanced = functools.partial(self._advance, move, done, end)
+            while not finished:
+                began, end = time.monotonic(), self._chunk_end(done, length)
+                advanced = functools.partial(self._advance, move, rows, done, end)
                 found = list(pool.map(advanced, groups, key_groups))
                 groups = [group for group, _ in found]
                 if done >= self.walk.warmup:
-                    kept += [_stacked(blocks) for blocks in zip(*(b for _, b in found), strict=True)]
+                    blocks = [_stacked(parts) for parts in zip(*(b for _, b in found), strict=True)]
+                    diverging += sum(int(block["diverging"].sum()) for block in blocks)
+                    kept += blocks
                 done = end
-                self._save(wanted, done, groups, kept)
-                progress.report(done, "draws" if done > self.walk.warmup else "warmup", _note(kept))
+                finished = done == total or self._is_enough(done, kept)
+                if self.options.checkpoint and (finished or pace.is_due()):
+                    pace.write(self.options.checkpoint, wanted, _snapshot(done, groups, kept))
+                note = f"{diverging} diverging" if diverging else ""
+                progress.report(done, "draws" if done > self.walk.warmup else "warmup", note)
+                if self.options.chunk is None and time.monotonic() - began < _SOON:
+                    length = min(2 * length, _MOST)
         return _joined(kept)
+
+    def _rows(self, chains: int) -> int:
+        """Steps per call for so many chains: enough that the call costs little beside them, in bounded memory."""
+        return max(1, min(_ROWS, _ENTRIES // (chains * self.target.dimension)))
 
     def _grouped(self, stacked: Any) -> list[Any]:
         """What is stacked by chain, in the groups that a call of the compiled functions serves: one chain, or all."""
@@ -169,27 +188,24 @@ class Loop:
         """What a checkpoint must be of; it may have fewer draws."""
         return identity(self.target, self.inputs, self.engine, self.key, free=("draws",))
 
-    def _compiled(self, function: Callable[..., Any], *settings: Any) -> Callable[..., Any]:
-        return self.target.compiled(function, self.walk, *settings)
-
-    def _advance(
-        self, move: Callable[..., Any], begin: int, end: int, chains: Chain, keys: PRNGKeyArray
+    def _advance(  # noqa: PLR0917
+        self, move: Callable[..., Any], most: int, begin: int, end: int, chains: Chain, keys: PRNGKeyArray
     ) -> tuple[Chain, list[dict[str, np.ndarray]]]:
         """A group of chains after steps `begin` to `end`, and these steps' rows, by one program for every chunk."""
         blocks: list[dict[str, np.ndarray]] = []
-        for first in range(begin, end, _ROWS):
-            rows = min(_ROWS, end - first)
+        for first in range(begin, end, most):
+            rows = min(most, end - first)
             chains, block = move(chains, keys, first, first + rows, self.inputs)
-            blocks.append(jax.tree.map(lambda x, rows=rows: np.asarray(x[:, :rows]), block))
+            blocks.append({name: np.asarray(x)[:, :rows] for name, x in block.items()})
         return chains, blocks
 
-    def _chunk_end(self, done: int) -> int:
+    def _chunk_end(self, done: int, length: int) -> int:
         """The end of the chunk that begins after `done` steps: no chunk crosses a phase, or a look at the draws."""
-        ends = [self.walk.explore, self.walk.warmup, self.schedule.total]
+        ends = [self.walk.warmup, self.schedule.total]
         if self.schedule.enough.ess:
             looks = max(done - self.walk.warmup, 0) // LOOK_EVERY + 1
             ends.append(self.walk.warmup + looks * LOOK_EVERY)
-        return min(done + self.options.chunk, *(end for end in ends if end > done))
+        return min(done + length, *(end for end in ends if end > done))
 
     def _is_enough(self, done: int, kept: list[dict[str, np.ndarray]]) -> bool:
         enough = self.schedule.enough
@@ -224,22 +240,19 @@ class Loop:
 
         def one(inputs: Inputs, key: PRNGKeyArray) -> Array:
             start_key = jax.random.fold_in(key, START)
-            found = starting_points(
+            return starting_points(
                 self.target, inputs, start_key, objective="density", values=values, starts=starts
             )
-            return found[-1]
 
         if self.walk.own:
-            return self.walk.over_chains(one, self.inputs, keys)
-        return jnp.stack([one(self.inputs, key) for key in keys])
+            return self.walk.over_chains(one, self.inputs, keys)[:, -1]
+        return jnp.asarray(np.stack([np.asarray(one(self.inputs, key))[-1] for key in keys]))
 
-    def _save(
-        self, wanted: Mapping[str, Any], done: int, groups: list[Chain], kept: list[dict[str, np.ndarray]]
-    ) -> None:
-        if self.options.checkpoint is not None:
-            state = [np.concatenate(leaves) for leaves in zip(*map(jax.tree.leaves, groups), strict=True)]
-            snapshot = checkpoint.Snapshot(done, state, _joined(kept) if kept else {})
-            checkpoint.write(self.options.checkpoint, wanted, snapshot)
+
+def _snapshot(done: int, groups: Sequence[Chain], kept: list[dict[str, np.ndarray]]) -> checkpoint.Snapshot:
+    """What a checkpoint holds of the chains and their draws so far."""
+    state = [np.concatenate(leaves) for leaves in zip(*map(jax.tree.leaves, groups), strict=True)]
+    return checkpoint.Snapshot(done, state, _joined(kept) if kept else {})
 
 
 def _stacked(blocks: Sequence[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
@@ -251,8 +264,3 @@ def _joined(kept: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
     """The blocks as one; the list then holds it alone."""
     kept[:] = [{name: np.concatenate([block[name] for block in kept], axis=1) for name in kept[0]}]
     return dict(kept[0])
-
-
-def _note(kept: list[dict[str, np.ndarray]]) -> str:
-    divergences = sum(int(block["diverging"].sum()) for block in kept)
-    return f"{divergences} diverging" if divergences else ""

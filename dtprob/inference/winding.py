@@ -11,6 +11,8 @@ centre - e).
 
 from __future__ import annotations
 
+import math
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, Scalar
@@ -18,7 +20,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 from dtprob.inference.circular import wrap
 
 _SOFTNESS = 0.5
-_HALF = jnp.pi / _SOFTNESS
+_HALF = math.pi / _SOFTNESS
 
 
 def log_window(offset: Float[Array, " angle"]) -> Scalar:
@@ -55,4 +57,4 @@ def _log_cosh(x: Array) -> Array:
     return jnp.logaddexp(x, -x) - jnp.log(2.0)
 
 
-_LOG_SINH = _HALF + jnp.log1p(-jnp.exp(-2 * _HALF)) - jnp.log(2.0)
+_LOG_SINH = _HALF + math.log1p(-math.exp(-2 * _HALF)) - math.log(2.0)

@@ -8,6 +8,7 @@ from dtprob.testing import check_engine
 SETTINGS = {
     "nuts": {"warmup": 300, "draws": 500, "chains": 2},
     "blackjax_nuts": {"warmup": 300, "draws": 500, "chains": 2},
+    "hmc": {"warmup": 300, "draws": 500, "chains": 2},
 }
 
 

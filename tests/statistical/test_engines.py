@@ -6,7 +6,7 @@ import pytest
 from arviz_stats.base import array_stats
 from scipy import stats
 
-from dtprob.inference import NUTS, SMC, SVI, BlackJAXNUTS, Ensemble, Exact, Laplace, RunOptions
+from dtprob.inference import HMC, NUTS, SMC, SVI, BlackJAXNUTS, Ensemble, Exact, Laplace, RunOptions
 from dtprob.testing.calibration import DRAWS, judge, simulated_ranks
 from dtprob.testing.calibration_cases import CASES
 from tests.unit.inference.examples import logistic, logistic_data
@@ -50,7 +50,9 @@ ENGINES = {
     "laplace, normal": (Laplace(draws=DRAWS, starts=1), 120),
     "ensemble, normal": (Ensemble(members=DRAWS, starts=1), 120),
     "exact, normal": (Exact(draws=DRAWS), 120),
+    "hmc, circular": (HMC(**SHORT), 60),
     "exact, multi_access": (Exact(draws=DRAWS), 60),
+    "exact, prediction_powered": (Exact(draws=DRAWS), 60),
     "nuts, custom": (NUTS(**SHORT), 60),
     "blackjax_nuts, phase_error_channel": (BlackJAXNUTS(**SHORT), 30),
 }

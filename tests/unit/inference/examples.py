@@ -58,6 +58,19 @@ def at_the_cut_data():
     return {"y": np.angle(np.exp(1j * np.random.default_rng(2).normal(np.pi, 0.6, 15)))}
 
 
+def spread_angles(y=None):
+    """Angles with an unknown common concentration, which von Mises EM finds step by step."""
+    concentration = numpyro.sample("concentration", dist.LogNormal(0.0, 1.0))
+    with numpyro.plate("angle", 3, dim=-1):
+        angle = numpyro.sample("direction", dist.VonMises(0.0, concentration))
+        with numpyro.plate("row", 15, dim=-2):
+            numpyro.sample("y", dist.VonMises(angle, 1.0), obs=y)
+
+
+def spread_angles_data():
+    return {"y": at_the_cut_data()["y"][:, None] + np.asarray([0.0, 1.0, 2.0])}
+
+
 def phase_errors(response, concentration, noise, h=None):
     """A channel whose paths have phase errors: h = sum_p e^{j z_p} a_p + noise, a_p of shape (frequency,)."""
     links, paths, frequencies = response.shape

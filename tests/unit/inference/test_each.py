@@ -20,6 +20,7 @@ def stacked():
 SHORT = {
     "nuts": {"warmup": 0, "draws": 4, "chains": 2},
     "blackjax_nuts": {"warmup": 0, "draws": 4, "chains": 2},
+    "hmc": {"warmup": 0, "draws": 4, "chains": 2},
     "laplace": {"draws": 20, "starts": 2},
 }
 
@@ -42,10 +43,11 @@ def test_the_same_draws_as_alone_but_for_rounding(engine):
         np.testing.assert_array_equal(together.observed["y"][number], alone.observed["y"])
 
 
-def test_each_has_its_own_posterior(tmp_path):
+@pytest.mark.parametrize("engine", ["nuts", "hmc"])
+def test_each_has_its_own_posterior(engine, tmp_path):
     """Means against the closed form: 40 z-scores, all below 4.5 (failure rate 3e-4); and the layout, kept on disk."""
     sets, data = stacked()
-    settings = {"engine": "nuts", "warmup": 150, "draws": 300, "chains": 2}
+    settings = {"engine": engine, "warmup": 150, "draws": 300, "chains": 2}
     posterior = fit_each(normal, data, ["y"], axis="place", key=KEY, **settings)
     assert posterior.draws["level"].shape == (2, 300, COUNT)
     assert posterior.log_likelihood["y"].shape == (2, 300, COUNT, len(sets[0]["y"]))
@@ -78,7 +80,7 @@ def test_angles_are_centred_for_each_by_itself():
 def test_what_it_refuses(tmp_path):
     _, data = stacked()
     attempts = {
-        "laplace, nuts or blackjax_nuts, got smc": {"engine": "smc"},
+        "laplace, hmc, nuts or blackjax_nuts, got smc": {"engine": "smc"},
         "no early stop": {"engine": "nuts", "enough_ess": 100},
         "no checkpoint": {"options": RunOptions(checkpoint=tmp_path / "run.h5")},
         "chains of engine nuts": {"engine": "nuts", "chains": 0},

@@ -1,18 +1,13 @@
 """The run loop: chunks, interruptions and the number of chains never change a draw; angles mix."""
 
 import json
-import signal
-import subprocess
-import sys
-import time
 
-import h5py
 import jax
 import numpy as np
 import pytest
 
 from dtprob.errors import InputError
-from dtprob.inference import NUTS, BlackJAXNUTS, RunOptions, summary
+from dtprob.inference import HMC, NUTS, BlackJAXNUTS, RunOptions, checkpoint, summary
 from dtprob.inference import run as run_module
 from dtprob.inference.build import build_target
 from tests.unit.inference.examples import (
@@ -26,7 +21,7 @@ from tests.unit.inference.examples import (
 )
 
 KEY = jax.random.key(21)
-ENGINES = [NUTS, BlackJAXNUTS]
+ENGINES = [NUTS, BlackJAXNUTS, HMC]
 SHORT = {"warmup": 60, "draws": 50, "chains": 2}
 
 
@@ -91,8 +86,8 @@ class StoppedError(Exception):
 
 
 def stop_after(monkeypatch, chunks):
-    """Let the run fail once so many checkpoints are written."""
-    write = run_module.checkpoint.write
+    """Let the run fail once so many checkpoints are written, one after each chunk."""
+    write = checkpoint.write
     written = []
 
     def writing(*arguments):
@@ -101,7 +96,9 @@ def stop_after(monkeypatch, chunks):
         if len(written) == chunks:
             raise StoppedError
 
-    monkeypatch.setattr(run_module.checkpoint, "write", writing)
+    monkeypatch.setattr(checkpoint, "write", writing)
+    monkeypatch.setattr(checkpoint, "SAVE_EVERY", 0.0)
+    monkeypatch.setattr(checkpoint, "_SAVE_SHARE", 0.0)
 
 
 @pytest.mark.parametrize("engine", ENGINES)
@@ -116,41 +113,6 @@ def test_an_interrupted_run_continues_as_if_nothing_had_happened(engine, chunks,
             engine(**SHORT)(KEY, at_the_cut, data, options=options)
     assert same(whole, engine(**SHORT)(KEY, at_the_cut, data, options=options))
     assert same(whole, engine(**SHORT)(KEY, at_the_cut, data, options=options))  # nothing left to do
-
-
-KILLED = """
-import sys
-import jax
-jax.config.update("jax_enable_x64", True)
-from pathlib import Path
-from dtprob.inference import NUTS, RunOptions
-sys.path.insert(0, "tests/unit/inference")
-from examples import normal, normal_data
-options = RunOptions(checkpoint=Path(sys.argv[1]), chunk=200, resume=True)
-posterior = NUTS(warmup=100, draws=int(sys.argv[2]), chains=1)(
-    jax.random.key(21), normal, normal_data(), options=options
-)
-posterior.save(sys.argv[3])
-"""
-
-
-def test_killed_without_warning_then_resumed(tmp_path):
-    from dtprob.inference import Posterior
-
-    draws = 30_000
-    path, result = tmp_path / "run.h5", tmp_path / "posterior.nc"
-    command = [sys.executable, "-c", KILLED, str(path), str(draws), str(result)]
-    process = subprocess.Popen(command)
-    while not path.exists() and process.poll() is None:
-        time.sleep(0.02)
-    process.send_signal(signal.SIGKILL)
-    process.wait()
-    assert not result.exists()
-    with h5py.File(path) as file:
-        assert 0 < file.attrs["done"] < draws + 100
-    subprocess.run(command, check=True)
-    whole = NUTS(warmup=100, draws=draws, chains=1)(KEY, normal, normal_data())
-    assert same(whole, Posterior.load(result))
 
 
 def test_a_checkpoint_of_another_run_is_refused(tmp_path):
@@ -229,12 +191,27 @@ def test_stops_early_once_there_is_enough(tmp_path):
     assert never.draws_per_chain == 300
 
 
+def test_chunks_grow_where_they_take_no_time(capfd):
+    NUTS(warmup=500, draws=1500, chains=1)(KEY, normal, normal_data(), options=RunOptions(progress=True))
+    assert len(capfd.readouterr().err.strip().splitlines()) < 12
+
+
+def test_a_checkpoint_is_written_at_most_once_a_second(tmp_path, monkeypatch):
+    """And in any case when the run is done."""
+    written = []
+    monkeypatch.setattr(checkpoint, "write", lambda *arguments: written.append(arguments))
+    monkeypatch.setattr(checkpoint, "SAVE_EVERY", 1e6)
+    NUTS(**SHORT)(KEY, normal, normal_data(), options=RunOptions(checkpoint=tmp_path / "run.h5", chunk=10))
+    assert [snapshot.done for _, _, snapshot in written] == [110]
+
+
 def test_silent_by_default(capfd):
     NUTS(**SHORT)(KEY, normal, normal_data())
     assert capfd.readouterr() == ("", "")
 
 
-def test_memory_on_the_device_does_not_grow_with_draws(monkeypatch):
+@pytest.mark.parametrize("engine", ENGINES)
+def test_memory_on_the_device_does_not_grow_with_draws(engine, monkeypatch):
     """Bytes of all live arrays at each report; 100,000 draws with their statistics would be 4.8 MB."""
     report, held = run_module.Progress.report, []
 
@@ -247,7 +224,7 @@ def test_memory_on_the_device_does_not_grow_with_draws(monkeypatch):
     for draws in (1_000, 100_000):
         held.clear()
         options = RunOptions(pointwise=False, chunk=1000)
-        NUTS(warmup=50, draws=draws, chains=1)(KEY, normal, normal_data(), options=options)
+        engine(warmup=50, draws=draws, chains=1)(KEY, normal, normal_data(), options=options)
         most.append(max(held))
     assert most[1] < most[0] + 100_000
 
@@ -258,14 +235,15 @@ def compiled(target):
     return {handle: size() for handle, size in kept.items() if size is not None}
 
 
-def test_one_program_for_every_chunk_draw_chain_and_data_set():
+@pytest.mark.parametrize("kind", ENGINES)
+def test_one_program_for_every_chunk_draw_chain_and_data_set(kind):
     """Chains are advanced by one compiled function, whatever there is of them."""
-    run = NUTS(warmup=60, draws=50, chains=2)
+    run = kind(warmup=60, draws=50, chains=2)
     run(KEY, normal, normal_data())
     target, _ = build_target(normal, normal_data())
     programs = compiled(target)
     for chunk, draws, chains, seed in ((7, 50, 2, 1), (100, 333, 3, 2)):
-        engine = NUTS(warmup=60, draws=draws, chains=chains)
+        engine = kind(warmup=60, draws=draws, chains=chains)
         engine(KEY, normal, normal_data(seed), options=RunOptions(chunk=chunk))
     assert compiled(target) == programs
 

@@ -1,4 +1,4 @@
-"""What the No-U-Turn samplers have in common: their settings, and the run."""
+"""What the samplers by Hamiltonian trajectories have in common: their settings, and the run."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 import jax
 
 from dtprob.inference.chains import ChainMethod
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions
+from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts
 from dtprob.inference.enough import Enough
 from dtprob.inference.kernel import Kernel
 from dtprob.inference.posterior import Posterior
@@ -19,8 +19,8 @@ from dtprob.models.declaration import Model
 
 
 @dataclass(frozen=True)
-class AbstractNoUTurn(AbstractEngine):
-    """A No-U-Turn sampler with windowed adaptation.
+class AbstractHamiltonian(AbstractEngine):
+    """A sampler by Hamiltonian trajectories with windowed adaptation.
 
     A draw depends on the key, its chain and its place in the chain; not on chunks, interruptions, or how many
     chains or draws there are. Angles do not get stuck at +-pi; see `dtprob.inference.winding`.
@@ -30,7 +30,6 @@ class AbstractNoUTurn(AbstractEngine):
         warmup: steps of each chain before them, in which it adapts.
         chains: how many chains.
         target_accept: acceptance rate that the step size is adapted to.
-        max_tree_depth: bound on the doublings of a trajectory.
         dense_mass: adapt a full mass matrix rather than a diagonal one.
         chain_method: "parallel" or "vectorized": each chain by itself, on as many cores as there are, or all in one
             program, which is faster on a GPU but makes the last bits of a draw depend on the number of chains.
@@ -38,15 +37,16 @@ class AbstractNoUTurn(AbstractEngine):
         enough_ess: stop once every coordinate has this effective sample size and no r-hat above `enough_rhat`;
             0 makes all draws.
         enough_rhat: see `enough_ess`.
+        least: the least that the settings of a trajectory's length can be.
     """
 
     answer: ClassVar[Answer] = "exact"
+    least: ClassVar[Mapping[str, int]]
 
     draws: int = 1000
     warmup: int = 1000
     chains: int = 4
     target_accept: float = 0.8
-    max_tree_depth: int = 10
     dense_mass: bool = False
     chain_method: ChainMethod = "parallel"
     initial: Mapping[str, Any] | None = None
@@ -58,7 +58,12 @@ class AbstractNoUTurn(AbstractEngine):
         """The transition, which adapts itself in the first `warmup` steps."""
 
     def schedule(self) -> Schedule:
-        """How long a run is."""
+        """How long a run is.
+
+        Raises:
+            InputError: a setting is too small.
+        """
+        check_counts(self, {"chains": 1, "warmup": 0, "draws": 1, **self.least})
         enough = Enough(self.enough_ess, self.enough_rhat)
         return Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial, enough)
 
