@@ -40,6 +40,9 @@ KINDS = [
     ((R, S), (3, 0)),
 ]
 MASK = np.array([[1, 1, 1, 1, 1, 1, 0], [0, 1, 1, 1, 1, 0, 1], [1, 1, 0, 1, 1, 1, 1]], bool)
+# Masked paths that other traces would find: a passage through the partition, a path of two reflections.
+BEYOND = np.array([[0, 0, 0, 0, 0, 0, 2], [0, 0, 0, 0, 0, 1, 0], [0] * 7])
+THERE = MASK | (BEYOND > 0)
 
 
 def trace(rx: Any = 0.0, tx: Any = 0.0, planes: Any = 0.0) -> PathSet:
@@ -72,8 +75,8 @@ def trace(rx: Any = 0.0, tx: Any = 0.0, planes: Any = 0.0) -> PathSet:
             departure=jnp.asarray(departure),
             arrival=jnp.asarray(arrival),
             mask=jnp.asarray(MASK),
-            interaction=jnp.asarray(np.where(MASK[..., None], code, NONE)),
-            object=jnp.asarray(np.where(MASK[..., None], objects, 0)),
+            interaction=jnp.asarray(np.where(THERE[..., None], code, NONE)),
+            object=jnp.asarray(np.where(THERE[..., None], objects, 0)),
             vertex=jnp.asarray(exact.vertex.reshape(*shape, 2, 3)),
             normal=jnp.asarray(normal.reshape(*shape, 2, 3)),
             length=jnp.asarray(length),
@@ -88,6 +91,8 @@ def trace(rx: Any = 0.0, tx: Any = 0.0, planes: Any = 0.0) -> PathSet:
             frequency=FREQUENCY,
             object_names=NAMES,
             material_names=("concrete", "brick"),
+            beyond=jnp.asarray(BEYOND),
+            beyond_names=("depth", "refraction"),
         )
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, Final
 
 import jax.numpy as jnp
@@ -27,12 +28,14 @@ from dtprob.raytracing.paths import SPECULAR, PathSet
 _IMAGE: Final = "Image method: the unfolded path is straight, so L' = |L k + s|."
 _SIZE: Final = 0.1
 """Prior standard deviation of a displacement in m."""
+_SAME_PLACE: Final = 1e-3
+"""Positions closer than this, in m, are one place."""
 _TURN: Final = 0.01
 """Prior standard deviation of an object's rotation in rad."""
 
 
 def receiver_displacement(sites: Sites, data: Data) -> list[Effect]:
-    """Receivers stand elsewhere: all shifted alike, or each by a random vector."""
+    """Receivers stand elsewhere: all shifted alike, each by a random vector, or those of one place."""
     if not _movable(sites, data):
         return []
     common = Effect(
@@ -43,11 +46,12 @@ def receiver_displacement(sites: Sites, data: Data) -> list[Effect]:
         source=_IMAGE,
         requires=("paths",),
     )
-    return [common, _jitter("receiver_displacement", sites, "receiver", unfolding.of_receiver)]
+    each = _jitter("receiver_displacement", sites, "receiver", unfolding.of_receiver)
+    return [common, each, *_one_place("receiver", sites, data, unfolding.of_receiver)]
 
 
 def transmitter_displacement(sites: Sites, data: Data) -> list[Effect]:
-    """Transmitters stand elsewhere: all shifted alike, or each by a random vector."""
+    """Transmitters stand elsewhere: all shifted alike, each by a random vector, or those of one place."""
     if not _movable(sites, data):
         return []
     common = Effect(
@@ -60,7 +64,8 @@ def transmitter_displacement(sites: Sites, data: Data) -> list[Effect]:
     )
     if len(np.unique(np.asarray(data["paths"].tx_position), axis=0)) == 1:
         return [common]
-    return [common, _jitter("transmitter_displacement", sites, "transmitter", unfolding.of_transmitter)]
+    each = _jitter("transmitter_displacement", sites, "transmitter", unfolding.of_transmitter)
+    return [common, each, *_one_place("transmitter", sites, data, unfolding.of_transmitter)]
 
 
 def object_displacement(sites: Sites, data: Data) -> list[Effect]:
@@ -162,6 +167,32 @@ def _jitter(family: str, sites: Sites, end: str, shift: Any) -> Effect:
         requires=("paths",),
         field_shape=lambda value, _: (value.shape[0], 1, 3),
     )
+
+
+def _one_place(end: str, sites: Sites, data: Data, shift: Any) -> list[Effect]:
+    """The device at one place stands elsewhere, for places that several links share; none where all links share one."""
+    attribute = {"receiver": "rx_position", "transmitter": "tx_position"}[end]
+    places, count = np.unique(np.asarray(getattr(data["paths"], attribute)), axis=0, return_counts=True)
+    if len(places) == 1:
+        return []
+
+    def shift_some(paths: PathSet, p: Mapping[str, Any], place: Any) -> Any:
+        apart = jnp.max(jnp.abs(getattr(paths, attribute) - jnp.asarray(place)), axis=-1)
+        return shift(paths, jnp.where(apart < _SAME_PLACE, 1.0, 0.0)[:, None, None] * p["displacement"])
+
+    return [
+        Effect(
+            f"{end}_displacement",
+            unfolding.rewrites(sites, partial(shift_some, place=place)),
+            (normal("displacement", _SIZE, "m", 3),),
+            instance=f"{end}_{number}",
+            physics=f"The {end} recorded at ({' '.join(f'{x:.1f}' for x in place)}) m stands a vector away from there.",
+            source=_IMAGE,
+            requires=("paths",),
+        )
+        for number, place in enumerate(places)
+        if count[number] > 1
+    ]
 
 
 def _normals(paths: PathSet, index: int) -> np.ndarray:

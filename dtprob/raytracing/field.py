@@ -164,7 +164,8 @@ def _receive(paths: PathSet, real: Vector, imaginary: Vector) -> Complex[Array, 
     """The gain lambda / (4 pi L) conj(F_r)^T E."""
     f_real, f_imaginary = components(jnp.real(paths.rx_field)), components(jnp.imag(paths.rx_field))
     length = jnp.where(paths.mask, paths.length, 1.0)
-    scale = jnp.where(paths.mask, paths.wavelength / (4 * jnp.pi) / length, 0.0)
+    scale = paths.wavelength / (4 * jnp.pi) / length
     gain_real = dot(f_real, real) + dot(f_imaginary, imaginary)
     gain_imaginary = dot(f_real, imaginary) - dot(f_imaginary, real)
-    return lax.complex(scale * gain_real, scale * gain_imaginary)
+    found = (jnp.where(paths.mask, scale * part, 0.0) for part in (gain_real, gain_imaginary))
+    return lax.complex(*found)

@@ -55,6 +55,10 @@ class PathSet(eqx.Module):
         material_names: names of its materials.
         scattering: scattering coefficient S per object, or None when all are 0; a specular reflection is
             weakened by sqrt(1 - S^2).
+        beyond: 0 for the paths of the set itself; k for paths that only another trace has, `beyond_names[k - 1]`. These
+            are masked, as if missing, but their arrays hold true values (see `dtprob.raytracing.beyond`). None
+            where there are none.
+        beyond_names: what the other traces had that this one had not.
         provenance: pairs of name and value that say where the paths come from (scene, solver, settings).
     """
 
@@ -80,6 +84,8 @@ class PathSet(eqx.Module):
     object_names: tuple[str, ...] = eqx.field(static=True)
     material_names: tuple[str, ...] = eqx.field(static=True)
     scattering: Float[Array, " object"] | None = None
+    beyond: Int[Array, "link path"] | None = None
+    beyond_names: tuple[str, ...] = eqx.field(static=True, default=())
     provenance: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
 
     @property
@@ -132,7 +138,7 @@ class PathSet(eqx.Module):
         chosen = {
             name: jnp.asarray(getattr(self, name))[index]
             for name, dims in DIMENSIONS.items()
-            if dims[0] == "link"
+            if dims[0] == "link" and getattr(self, name) is not None
         }
         return eqx.tree_at(
             lambda paths: [getattr(paths, name) for name in chosen], self, list(chosen.values())
@@ -159,6 +165,7 @@ DIMENSIONS: Final[dict[str, tuple[str, ...]]] = {
     "conductivity": ("object",),
     "thickness": ("object",),
     "scattering": ("object",),
+    "beyond": ("link", "path"),
 }
 """The axes of every array of a `PathSet`."""
 
@@ -188,6 +195,8 @@ def validate(paths: PathSet) -> PathSet:
         raise InputError("paths.interaction", expected, str(sorted(codes - set(INTERACTIONS))), _REMEDY)
     _check_range("object", paths.object, paths.n_object)
     _check_range("object_material", paths.object_material, paths.n_material)
+    if paths.beyond is not None:
+        _check_range("beyond", paths.beyond, len(paths.beyond_names) + 1)
     if not paths.frequency > 0:
         raise InputError("paths.frequency", "a positive carrier in Hz", repr(paths.frequency), _REMEDY)
     _check_physics(paths)

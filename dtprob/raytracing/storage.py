@@ -16,7 +16,7 @@ from dtprob.raytracing.paths import DIMENSIONS, PathSet, validate
 
 FORMAT: Final = "dtprob.paths"
 FORMAT_VERSION: Final = 1
-_OPTIONAL: Final = frozenset({"scattering"})
+_OPTIONAL: Final = frozenset({"scattering", "beyond"})
 _REMEDY: Final = "Trace the scene again and save the path set with this version of dtprob"
 
 
@@ -52,6 +52,7 @@ def save(paths: PathSet, file: str | os.PathLike[str]) -> None:
         "format_version": FORMAT_VERSION,
         "frequency": paths.frequency,
         "provenance": json.dumps(paths.provenance),
+        "beyond_names": json.dumps(paths.beyond_names),
     }
     with atomic_write(file) as temporary:
         xr.Dataset(variables, attrs=attributes).to_netcdf(temporary, engine="h5netcdf")
@@ -82,6 +83,7 @@ def load(file: str | os.PathLike[str]) -> PathSet:
             frequency=float(data.attrs["frequency"]),
             object_names=tuple(map(str, data["object_name"].to_numpy())),
             material_names=tuple(map(str, data["material_name"].to_numpy())),
+            beyond_names=tuple(json.loads(data.attrs.get("beyond_names", "[]"))),
             provenance=tuple((name, value) for name, value in json.loads(data.attrs["provenance"])),
         )
     )

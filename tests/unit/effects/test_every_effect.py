@@ -1,4 +1,4 @@
-"""What must hold for each effect on channels, checked for each; networks and labels have tests of their own."""
+"""What must hold for each effect on channels; networks, labels and several transmitters have tests of their own."""
 
 import jax
 import jax.numpy as jnp
@@ -9,7 +9,7 @@ from numpyro import handlers
 
 from dtprob.effects import FAMILIES, Rewriting, catalogue, labels, network, with_effects
 
-OTHERS = {*network.FAMILIES, *labels.FAMILIES}
+OTHERS = {*network.FAMILIES, *labels.FAMILIES, "swapped_transmitters"}
 # fmt: off
 PINNED = {
     "phase_error", "receiver_displacement", "object_displacement", "material_mismatch",

@@ -100,7 +100,14 @@ def test_powers_alone_offer_no_phases(world):
     assert offered == {
         *("material_mismatch", "reflection_loss", "rough_surface", "penetration", "polarization_mismatch"),
         *("missing_path", "blockage", "shadowing", "path_gain_error", "atmospheric_attenuation"),
-        *("path_loss_exponent", "antenna_pattern"),
+        *(
+            "path_loss_exponent",
+            "antenna_pattern",
+            "missing_object",
+            "depth_cut_off",
+            "refraction_off",
+            "wall_law",
+        ),
     }
     assert all(p.name != "phase" for effect in effects for p in effect.parameters)
 
