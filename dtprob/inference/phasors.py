@@ -1,4 +1,4 @@
-"""A least-squares start for the phases of Gaussian observations.
+"""Least squares for the phases of Gaussian observations: a start, and the reference E-step.
 
 Where every observation is normal with a mean affine in x_e = (cos z_e, sin z_e), the x_e are found as if
 they were free, and their directions kept: the reference E-step of Ruah et al. (arXiv 2312.12625), with the
@@ -7,6 +7,9 @@ of the angles.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +38,42 @@ def least_squares_start(
         rest: all coordinates; those of the angles are not used.
         inputs: the target's arrays.
     """
+    return _solution(_equations(target, rest, inputs), layout)
+
+
+def reference_phases(
+    target: Target, layout: Layout, rest: Float[Array, " dimension"], inputs: Inputs
+) -> tuple[Float[Array, "group colour"], Float[Array, "group colour"]]:
+    """Directions (rad) and concentrations of the angles by the E-step of Ruah et al..
+
+    Directions are those of least squares; with SNR the squared amplitude of a path over the noise power, the
+    concentration is 2 sqrt(SNR (SNR - 1)), and 0 where SNR is below 1.
+
+    Args:
+        target: a target whose observations are complex normal.
+        layout: the groups and colours of the angles.
+        rest: all coordinates; those of the angles are not used.
+        inputs: the target's arrays.
+    """
+    equations = _equations(target, rest, inputs)
+
+    def own(colour: Array) -> Float[Array, " group"]:
+        entries = layout.table[:, colour]  # of different groups, which do not meet in the data
+        one = jnp.zeros((target.angles.size, 2), rest.dtype).at[entries, 0].set(1.0)
+        return 0.5 * equations.product(one)[entries, 0]
+
+    snr = jax.lax.map(own, jnp.arange(layout.table.shape[1])).T
+    return _solution(equations, layout).direction, 2 * jnp.sqrt(snr * jnp.maximum(snr - 1, 0.0))
+
+
+class _Equations(NamedTuple):
+    """The normal equations of least squares: the product with their matrix, and their right-hand side."""
+
+    product: Callable[[Float[Array, "angle 2"]], Float[Array, "angle 2"]]
+    right: Float[Array, "angle 2"]
+
+
+def _equations(target: Target, rest: Array, inputs: Inputs) -> _Equations:
     zero = jnp.zeros(target.angles.shape, rest.dtype)
     quarter = zero + 0.5 * jnp.pi
     data, _, weight = _observations(target, zero, rest, inputs)
@@ -47,14 +86,14 @@ def least_squares_start(
         return from_cos + jax.jvp(mean, (zero,), (x[:, 1],))[1]
 
     base = 0.5 * (mean(zero) + mean(zero + jnp.pi))
-    start = jnp.zeros((zero.shape[0], 2), rest.dtype)
-    _, backward = jax.vjp(forward, start)
+    _, backward = jax.vjp(forward, jnp.zeros((zero.shape[0], 2), rest.dtype))
     right = backward(weight * (data - base))[0] + _prior_parameter(target, rest, inputs)
-    found, _ = jax.scipy.sparse.linalg.cg(
-        lambda x: backward(weight * forward(x))[0], right, maxiter=_ITERATIONS, tol=1e-8
-    )
-    found = jnp.where(jnp.isfinite(found), found, 0.0)
-    found = found[layout.table]
+    return _Equations(lambda x: backward(weight * forward(x))[0], right)
+
+
+def _solution(equations: _Equations, layout: Layout) -> Resultants:
+    found, _ = jax.scipy.sparse.linalg.cg(equations.product, equations.right, maxiter=_ITERATIONS, tol=1e-8)
+    found = jnp.where(jnp.isfinite(found), found, 0.0)[layout.table]
     length = jnp.minimum(jnp.linalg.norm(found, axis=-1), 1.0)
     return Resultants(jnp.arctan2(found[..., 1], found[..., 0]), length)
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, Final, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ import numpy as np
 from jax.scipy.special import i0e, i1e
 from jaxtyping import Array, Bool, Float, PRNGKeyArray, Scalar
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, unknown_name
 from dtprob.inference import von_mises
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
@@ -33,7 +33,7 @@ from dtprob.inference.engine import (
 )
 from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.optimise import minimise
-from dtprob.inference.phasors import is_gaussian, least_squares_start
+from dtprob.inference.phasors import is_gaussian, least_squares_start, reference_phases
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.relaxation import (
     Layout,
@@ -47,6 +47,9 @@ from dtprob.inference.target import Inputs, Target
 from dtprob.models.declaration import Model
 
 _SWEEPS = 1000
+
+type EStep = Literal["exact", "reference"]
+_E_STEPS: Final[tuple[EStep, ...]] = ("exact", "reference")
 
 
 class VonMises(NamedTuple):
@@ -115,6 +118,10 @@ class VonMisesEM(AbstractEngine):
     are Gaussian, from least squares; each group of coupled angles keeps the lowest. Once it has settled it
     starts the E-step afresh, until that brings nothing more.
 
+    With `e_step = "reference"` the E-step is the paper's: directions by least squares, as if phasors were free
+    numbers, and concentrations from each path's signal-to-noise ratio. It needs complex normal observations, may
+    raise the free energy, and stops where it no longer lowers it. Where paths are resolved it is as good.
+
     The posterior's `extra` has `free_energy`, its history `free_energy_history`, `converged`, and for each
     circular site `direction.<site>` (rad) and `concentration.<site>`.
 
@@ -125,6 +132,7 @@ class VonMisesEM(AbstractEngine):
         newton_steps: optimiser steps in an M-step.
         spread_starts: from how many spread directions the E-step starts.
         initial: constrained values that the sites without angles start from; by default the prior's median.
+        e_step: "exact" coordinate updates, or that of the "reference".
     """
 
     name: ClassVar[str] = "von_mises_em"
@@ -137,6 +145,7 @@ class VonMisesEM(AbstractEngine):
     newton_steps: int = 3
     spread_starts: int = 16
     initial: Mapping[str, Any] | None = None
+    e_step: EStep = "exact"
 
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
@@ -149,6 +158,7 @@ class VonMisesEM(AbstractEngine):
             expected = "a latent site with circular support"
             remedy = "Sample the phases from VonMises, or use another engine"
             raise InputError(f"von_mises_em on model {target.declaration.name}", expected, "none", remedy)
+        self._check_e_step(target)
         layout = find_layout(target, inputs, layout_key)
         job = Job(self, target, inputs, key, options, free=("draws",))
         settling, history = iterate(job, self._steps(target, inputs, layout))
@@ -167,6 +177,16 @@ class VonMisesEM(AbstractEngine):
             | {"free_energy_history": energies[np.isfinite(energies)], "converged": settling.converged},
         )
 
+    def _check_e_step(self, target: Target) -> None:
+        if self.e_step not in _E_STEPS:
+            raise unknown_name("e_step of von_mises_em", self.e_step, _E_STEPS, "E-step")
+        kinds = sorted({str(site.distribution) for site in target.declaration.observed.values()})
+        if self.e_step == "reference" and kinds != ["ComplexNormal"]:
+            remedy = "Use the exact E-step"
+            raise InputError(
+                "observations for the reference E-step", "ComplexNormal", ", ".join(kinds), remedy
+            )
+
     def _steps(self, target: Target, inputs: Inputs, layout: Layout) -> Steps[Settling]:
         """An iteration is an M- and an E-step; once they have settled, also the E-step afresh."""
 
@@ -178,10 +198,14 @@ class VonMisesEM(AbstractEngine):
             return Settling(stage, stage.free_energy, jnp.zeros((), dtype=bool))
 
         def step(_: int, before: Settling) -> tuple[Settling, dict[str, Any]]:
-            stage = _refine(target, layout, before.stage, self.newton_steps, inputs)
+            stage = self._refined(target, layout, before.stage, inputs)
             refined, again = stage.free_energy, jnp.full_like(stage.free_energy, jnp.nan)
             if before.stage.free_energy - refined >= self.tolerance:
                 return before._replace(stage=stage), {"free_energy": jnp.stack([refined, again])}
+            if self.e_step == "reference":  # nothing to start afresh from: it does not depend on where it is
+                return Settling(before.stage, before.first, jnp.ones((), dtype=bool)), {
+                    "free_energy": jnp.stack([refined, again])
+                }
             stage = self._restart(target, layout, stage.angles, stage.rest, inputs)
             converged = refined - stage.free_energy < self.tolerance
             row = {"free_energy": jnp.stack([refined, stage.free_energy])}
@@ -196,10 +220,20 @@ class VonMisesEM(AbstractEngine):
             note=lambda settling: f"free energy {float(settling.stage.free_energy):.6g} nats",
         )
 
+    def _refined(self, target: Target, layout: Layout, stage: Stage, inputs: Inputs) -> Stage:
+        """An M-step, and an E-step that continues."""
+        rest = target.compiled(_m_step, self.newton_steps)(layout, stage, inputs)
+        if self.e_step == "reference":
+            return _reference(target, layout, rest, inputs)
+        form = target.compiled(quadratic)(layout, rest, inputs)
+        return _e_step(form, jax.tree.map(lambda leaf: leaf[None], stage.angles.resultants), rest)
+
     def _restart(
         self, target: Target, layout: Layout, angles: VonMises, rest: Array, inputs: Inputs
     ) -> Stage:
         """An E-step from where the angles are and from fresh starts."""
+        if self.e_step == "reference":
+            return _reference(target, layout, rest, inputs)
         zero = -inputs.location[target.angles][layout.table]
         fixed = jax.random.key(0)  # the same starts in every run
         spread = jax.random.uniform(
@@ -230,11 +264,11 @@ def _facts(target: Target, inputs: Inputs, layout: Layout, stage: Stage) -> dict
     return {name: np.asarray(value) for name, value in facts.items()}
 
 
-def _refine(target: Target, layout: Layout, stage: Stage, steps: int, inputs: Inputs) -> Stage:
-    """An M-step, and an E-step that continues."""
-    rest = target.compiled(_m_step, steps)(layout, stage, inputs)
+def _reference(target: Target, layout: Layout, rest: Array, inputs: Inputs) -> Stage:
+    """The E-step of the reference."""
+    angles = VonMises(*target.compiled(reference_phases)(layout, rest, inputs))
     form = target.compiled(quadratic)(layout, rest, inputs)
-    return _e_step(form, jax.tree.map(lambda leaf: leaf[None], stage.angles.resultants), rest)
+    return Stage(angles, rest, jnp.sum(_group_free_energy(form, angles)) - form.constant)
 
 
 def _m_step(target: Target, steps: int, layout: Layout, stage: Stage, inputs: Inputs) -> Array:

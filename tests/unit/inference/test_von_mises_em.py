@@ -80,6 +80,37 @@ def test_agrees_with_the_closed_form(spread, concentration, seed):
     assert bool(posterior.extra["converged"])
 
 
+@pytest.mark.parametrize("noise", [0.1, 4.0])
+def test_the_reference_e_step_is_the_papers(noise):
+    data, _ = phase_errors_data(links=5, paths=3, noise=noise)
+    posterior = VonMisesEM(draws=10, e_step="reference")(KEY, phase_errors, data)
+    snr = np.sum(np.abs(data["response"]) ** 2, axis=2) / noise
+    expected = [
+        least_squares(response, h, data["concentration"], noise)
+        for response, h in zip(data["response"], data["h"], strict=True)
+    ]
+    turn = np.exp(1j * posterior.extra["direction.phase"]) / np.stack(expected)
+    np.testing.assert_allclose(np.angle(turn), 0, atol=1e-6)
+    kappa = 2 * np.sqrt(np.where(snr > 1, snr * (snr - 1), 0))
+    np.testing.assert_allclose(posterior.extra["concentration.phase"], kappa, rtol=1e-6, atol=1e-9)
+    assert bool(posterior.extra["converged"])
+    exact = VonMisesEM(draws=10)(KEY, phase_errors, data)
+    assert float(exact.extra["free_energy"]) < float(posterior.extra["free_energy"])
+
+
+def test_e_steps_that_are_not_there_are_refused():
+    with pytest.raises(InputError, match="Did you mean 'reference'"):
+        VonMisesEM(e_step="referense")(KEY, phase_errors, phase_errors_data(links=1, paths=1)[0])
+    with pytest.raises(InputError, match="expected ComplexNormal, got VonMises"):
+        VonMisesEM(e_step="reference")(KEY, _directions, {"seen": np.array([0.1, 0.2])})
+
+
+def _directions(seen=None):
+    angle = numpyro.sample("angle", dist.VonMises(0.0, 1.0))
+    with numpyro.plate("packet", 2):
+        numpyro.sample("seen", dist.VonMises(angle, 2.0), obs=seen)
+
+
 def test_one_path_is_exact():
     data, _ = phase_errors_data(links=8, paths=1)
     posterior = VonMisesEM(draws=20_000)(KEY, phase_errors, data)
