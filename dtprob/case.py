@@ -66,6 +66,10 @@ class SceneSection:
         device_height: m, added to the height of both ends of each link.
         ceiling_height: m, of the rooms of a floor plan.
         wall_material, wall_thickness: of the walls of a floor plan; thickness in m.
+        strongest: at most so many paths of each link are kept; None keeps all.
+        check_depth: most interactions of a second trace, whose additional paths only the effect depth_cut_off uses.
+        check_refraction: the same of a trace through walls, for refraction_off.
+        check_transmitters: the same of traces from each other transmitter's place, for swapped_transmitters.
     """
 
     file: str
@@ -83,6 +87,10 @@ class SceneSection:
     ceiling_height: float | None = None
     wall_material: str = "brick"
     wall_thickness: float | None = None
+    strongest: int | None = None
+    check_depth: int | None = None
+    check_refraction: bool = False
+    check_transmitters: bool = False
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -96,6 +104,23 @@ class EffectsSection:
 
     use: str | tuple[str, ...] = "all"
     exclude: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class DiagnosisSection:
+    """[diagnosis]: the effort of a diagnosis; less of it is faster and misses more.
+
+    Attributes:
+        candidates: how many effects are refitted in full at each step.
+        polished: how many fits are freed from local optima of the unknown parameters at each step; 0 for none.
+        max_effects: the largest set of effects that is looked for.
+        tolerance_db: residual error that does not matter, in dB below the signal; of powers, their rms error in dB.
+    """
+
+    candidates: int = 6
+    polished: int = 3
+    max_effects: int = 3
+    tolerance_db: float | None = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -128,7 +153,7 @@ class Case:
 
     Attributes:
         path: the TOML file.
-        model, data, scene, effects, engine, seed: its sections; scene is None where there is none.
+        model, data, scene, effects, diagnosis, engine, seed: its sections; scene is None where there is none.
     """
 
     path: Path
@@ -136,6 +161,7 @@ class Case:
     data: DataSection
     scene: SceneSection | None = None
     effects: EffectsSection = field(default_factory=EffectsSection)
+    diagnosis: DiagnosisSection = field(default_factory=DiagnosisSection)
     engine: EngineSection = field(default_factory=EngineSection)
     seed: SeedSection = field(default_factory=SeedSection)
 
@@ -157,6 +183,7 @@ _SECTIONS: dict[str, type] = {
     "data": DataSection,
     "scene": SceneSection,
     "effects": EffectsSection,
+    "diagnosis": DiagnosisSection,
     "engine": EngineSection,
     "seed": SeedSection,
 }
@@ -270,6 +297,7 @@ _KINDS: dict[Any, tuple[str, Any]] = {
     Path: ("the name of a file", _is_text),
     Path | None: ("the name of a file", _is_text),
     int: ("a whole number from 0", _is_whole),
+    int | None: ("a whole number from 1", lambda value: _is_whole(value) and value > 0),
     float | None: ("a positive number", lambda value: _is_number(value) and 0 < value < float("inf")),
     bool: ("true or false", lambda value: isinstance(value, bool)),
     str | tuple[str, ...]: ("'all', a list of names, or 'module:name'", _is_names),

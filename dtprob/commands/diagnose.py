@@ -1,5 +1,6 @@
 """`dtprob diagnose`: from a CASE to a report of why data and twin differ."""
 
+import dataclasses
 import json
 import time
 from collections.abc import Mapping, Sequence
@@ -96,6 +97,7 @@ def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tupl
         key=prepared.key,
         engine=prepared.engine,
         cluster=prepared.cluster,
+        settings=Settings(**dataclasses.asdict(prepared.case.diagnosis)),
         reference=reference,
         designs=prepared.designs,
         say=job.say,

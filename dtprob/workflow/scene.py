@@ -5,18 +5,30 @@ import hashlib
 import json
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from dtprob.case import Case, SceneSection
 from dtprob.data import ChannelData, PowerData
 from dtprob.data.location import located
+from dtprob.effects.mistaken import place_name
+from dtprob.effects.solver import DEPTH, REFRACTION
 from dtprob.errors import InputError
 from dtprob.raytracing import storage
+from dtprob.raytracing.beyond import strongest, with_beyond
 from dtprob.raytracing.paths import PathSet
 
 _WALL_THICKNESS = 0.12
+_OTHER_DEPTH = 2
+"""Most interactions on paths from another transmitter's place."""
+_APART = 1e-2
+"""Ends closer than this, in m, cannot be traced."""
+_MOST_BEYOND = 64
+"""Paths of another trace that are kept for each link where the case does not say."""
 
 
 def reached[Links: ChannelData | PowerData](
@@ -66,6 +78,7 @@ def paths_of(
         remedy = "Add [scene] with file and frequency"
         raise InputError(case.path.name, f"a section [scene] for {case.model.name}", "none", remedy)
     if scene.file.lower().endswith(".nc"):
+        _check_needs_no_trace(scene, case)
         return _same_links(storage.load(scene.file), _placed(scene, data), case)
     kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
     if kept is not None and kept.is_file():
@@ -112,24 +125,69 @@ def _load(scene: SceneSection, frequency: float) -> Any:
     return floorplan_scene(plan.walls, scene.ceiling_height, frequency, wall=wall, furniture=plan.furniture)
 
 
-def _trace(scene: SceneSection, data: ChannelData | PowerData) -> PathSet:
-    from dtprob.raytracing.trace import trace  # noqa: PLC0415  (needs the ray tracer)
+def _check_needs_no_trace(scene: SceneSection, case: Case) -> None:
+    asked = [
+        n for n in ("strongest", "check_depth", "check_refraction", "check_transmitters") if getattr(scene, n)
+    ]
+    if asked:
+        where = f"{case.path.name} [scene] {asked[0]}"
+        raise InputError(where, "a scene to trace", Path(scene.file).name, "Name the scene, or leave it out")
 
-    frequency = float(scene.frequency or 0.0)
-    return trace(
-        _load(scene, frequency),
-        data.tx_position,
-        data.rx_position,
-        max_depth=scene.max_depth,
-        refraction=scene.refraction,
-        diffraction=scene.diffraction,
-        diffuse_reflection=scene.diffuse_reflection,
-        tx_pattern=scene.tx_pattern,
-        rx_pattern=scene.rx_pattern,
-        polarization=scene.polarization,
-        frequency=frequency,
-        allow_empty=True,
-    )
+
+def _trace(scene: SceneSection, data: ChannelData | PowerData) -> PathSet:
+    """The twin's paths, and apart from them those of the traces that the case wants for a check."""
+    traced = _Traced(scene, _load(scene, float(scene.frequency or 0.0)), data)
+    paths = traced.paths(scene.max_depth, refraction=scene.refraction)
+    fuller: dict[str, PathSet] = {}
+    if scene.check_depth is not None:
+        fuller[DEPTH] = traced.paths(scene.check_depth, refraction=scene.refraction)
+    if scene.check_refraction and not scene.refraction:
+        fuller[REFRACTION] = traced.paths(scene.max_depth, refraction=True)
+    if scene.check_transmitters:
+        for number, place in enumerate(np.unique(data.tx_position, axis=0)):
+            depth = min(scene.max_depth, _OTHER_DEPTH)
+            fuller[place_name(number)] = traced.paths(depth, refraction=scene.refraction, source=place)
+    known = paths
+    paths = paths if scene.strongest is None else strongest(paths, scene.strongest)
+    for name, other in fuller.items():
+        paths = with_beyond(paths, name, other, scene.strongest or _MOST_BEYOND, known=known)
+    return paths
+
+
+class _Traced(NamedTuple):
+    """A loaded scene and the links to trace through it."""
+
+    section: SceneSection
+    scene: Any
+    data: ChannelData | PowerData
+
+    def paths(
+        self, max_depth: int, *, refraction: bool, source: Float[np.ndarray, "3"] | None = None
+    ) -> PathSet:
+        """The paths of all links, from their own transmitters or from one place; none where the receiver stands there."""
+        from dtprob.raytracing.trace import trace  # noqa: PLC0415  (needs the ray tracer)
+
+        section, data = self.section, self.data
+        there = np.zeros(len(data.rx_position), bool)
+        sources = data.tx_position
+        if source is not None:
+            there = np.linalg.norm(data.rx_position - source, axis=1) < _APART
+            sources = np.where(there[:, None], data.tx_position, source)
+        paths = trace(
+            self.scene,
+            sources,
+            data.rx_position,
+            max_depth=max_depth,
+            refraction=refraction,
+            diffraction=section.diffraction,
+            diffuse_reflection=section.diffuse_reflection,
+            tx_pattern=section.tx_pattern,
+            rx_pattern=section.rx_pattern,
+            polarization=section.polarization,
+            frequency=float(section.frequency or 0.0),
+            allow_empty=True,
+        )
+        return eqx.tree_at(lambda p: p.mask, paths, paths.mask & ~jnp.asarray(there)[:, None])
 
 
 def _scene_hash(scene: SceneSection, data: ChannelData | PowerData) -> str:

@@ -1,5 +1,6 @@
 """CASE files: what is right is read as written, what is wrong is named with the remedy."""
 
+import dataclasses
 import pickle
 from pathlib import Path
 
@@ -67,6 +68,27 @@ def test_defaults(tmp_path):
     assert case.scene is None
     assert (case.effects.use, case.engine.name, case.seed.value) == ("all", "laplace", 0)
     assert (case.data.reference, case.data.phase, case.data.cluster) == (None, None, None)
+
+
+def test_effort_of_a_diagnosis_can_be_said(tmp_path):
+    from dtprob.gap.settings import Settings
+
+    plain = load_case(written(tmp_path, SHORT)).diagnosis
+    assert Settings(**dataclasses.asdict(plain)) == Settings()
+    asked = "[diagnosis]\npolished = 0\nmax_effects = 1\ntolerance_db = 20\n"
+    case = load_case(written(tmp_path, f"{SHORT}{asked}"))
+    assert (case.diagnosis.polished, case.diagnosis.max_effects, case.diagnosis.tolerance_db) == (0, 1, 20.0)
+    with pytest.raises(InputError, match="a whole number from 0"):
+        load_case(written(tmp_path, f"{SHORT}[diagnosis]\ncandidates = -1\n"))
+
+
+def test_what_a_trace_is_checked_with(tmp_path):
+    scene = '[scene]\nfile = "munich"\nfrequency = 6e9\nstrongest = 8\ncheck_depth = 4\n'
+    found = load_case(written(tmp_path, f"{SHORT}{scene}")).scene
+    assert found is not None
+    assert (found.strongest, found.check_depth, found.check_refraction) == (8, 4, False)
+    with pytest.raises(InputError, match="a whole number from 1"):
+        load_case(written(tmp_path, f"{SHORT}{scene}".replace("= 8", "= 0")))
 
 
 def test_paths_of_scenes_are_relative_to_the_case(tmp_path):

@@ -81,6 +81,58 @@ def test_a_reduced_diagnosis_finds_a_gap(prepared):
     assert -15 < before < 3
 
 
+PLAN = """{"walls_xyxy": [[0, 0, 8, 0], [8, 0, 8, 5], [8, 5, 0, 5], [0, 5, 0, 0], [4, 0, 4, 5]]}"""
+CHECKED = """
+[model]
+name = "ray_traced_channel"
+[data]
+file = "channels.npz"
+[scene]
+file = "plan.json"
+frequency = 4e9
+max_depth = 1
+ceiling_height = 3.0
+merge_shapes = false
+skip_unreached = true
+strongest = 4
+check_depth = 2
+check_refraction = true
+check_transmitters = true
+[effects]
+use = ["depth_cut_off", "refraction_off", "swapped_transmitters"]
+"""
+
+
+@pytest.mark.libllvm
+def test_what_the_tracer_leaves_out_becomes_candidates(tmp_path):
+    pytest.importorskip("sionna.rt", exc_type=ImportError)
+    (tmp_path / "plan.json").write_text(PLAN)
+    (tmp_path / "case.toml").write_text(CHECKED)
+    tx = np.array([[1.0, 1.0, 1.5], [1.0, 1.0, 1.5], [2.0, 4.0, 1.5], [2.0, 4.0, 1.5]])
+    rx = np.array([[3.0, 2.0, 1.2], [2.0, 4.0, 1.5], [3.0, 2.0, 1.2], [7.0, 3.0, 1.2]])
+    frequency = 1e6 * np.arange(4)
+    np.savez(
+        tmp_path / "channels.npz",
+        channel=np.ones((4, 1, 1, 1, 4), complex),
+        subcarrier_frequency=frequency,
+        tx_position=tx,
+        rx_position=rx,
+    )
+    found = prepare(load_case(tmp_path / "case.toml"), need="diagnosis")
+    paths = found.data["paths"]
+    assert paths.beyond_names == ("depth", "refraction", "transmitter_0", "transmitter_1")
+    assert [e.name for e in found.effects] == [
+        *("depth_cut_off", "refraction_off", "swapped_transmitters[0_1]"),
+    ]
+    assert np.asarray(paths.mask).sum(axis=1).tolist() == [4, 4, 4]  # behind the wall nothing arrives
+    code, step = np.asarray(paths.beyond), np.asarray(paths.interaction)
+    assert np.all((step[code == 1] != 0).sum(axis=-1) == 2)
+    assert np.all((step[code == 2] == 4).any(axis=-1))
+    # a link's own transmitter brings nothing new, and the second link's receiver stands where the second transmitter does
+    assert (code == 3).sum(axis=1).tolist() == [0, 0, 4]
+    assert (code == 4).sum(axis=1).tolist() == [4, 0, 0]
+
+
 def test_readers_options_are_checked(tmp_path):
     from dtprob.data import read
 
