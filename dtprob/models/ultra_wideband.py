@@ -10,7 +10,7 @@ before (`dtprob.data.uwb_apartment`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, Literal, NamedTuple
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -41,10 +41,18 @@ _AXES: Final = AXES | {"receiver_gain": ("link",), "receiver_delay": ("link",)}
 _LOG_GAINS: Final = range(1, 9)
 _PHASES: Final = range(2, 9)
 _DELAY_SPREAD: Final = 0.5e-9
+_RANGING_OFFSET: Final = (2.0e-9, 1.0e-9)
+"""Mean and standard deviation, s, of what is common to all errors of ranging, the rise of the pulse included."""
+_RANGING_SPREAD: Final = 0.6e-9
+_RANGING_TAIL: Final = 3.0
 _GAIN_SPREAD: Final = 0.35
 _TRANSMITTED: Final = 3.7e-5
 _SATURATED: Final = 1.3e-11
 _LAGS: Final = np.arange(-2e-9, 14e-9, 0.1e-9)
+
+
+type TimeOrigin = Literal["searched", "ranged"]
+"""What is known of a link's time origin: where the data match the twin, or what two-way ranging says."""
 
 
 class _Receiver(NamedTuple):
@@ -74,6 +82,7 @@ def ultra_wideband_channel(
     rough_delay: Float[Array, " link"] | None = None,
     link_power: Float[Array, " link"] | None = None,
     model_error: float = 0.1,
+    time_origin: TimeOrigin = "searched",
     phase: Literal["per_packet"] = "per_packet",
     materials: Materials = "per_material",
     law: Law = "slab",
@@ -94,6 +103,9 @@ def ultra_wideband_channel(
         link_power: W, mean of |channel|^2 of each measured link, from `link_power`; with `noise_power`.
         model_error: share of it by which the best twin is wrong, the same in all snapshots of a link. Ends
             rounded to 1 cm turn the paths at 4 GHz by 0.34 rad: 0.1.
+        time_origin: "searched" centres each delay on `rough_delay`, which leaves the time of flight unused; "ranged"
+            on an offset common to all links, with errors of 0.6 ns and heavy tails (Student's t with 3 degrees of
+            freedom), as two-way ranging has: devices that are not where the twin has them then show.
         phase: "per_packet", the only one: phases of different packets cannot be compared.
         materials: which permittivities and conductivities are unknown, as in `ray_traced_channel`.
         law: "slab" (finite thickness) or "half_space".
@@ -103,13 +115,15 @@ def ultra_wideband_channel(
         The noiseless channel.
 
     Raises:
-        InputError: another `phase`, or arrays that do not fit together.
+        InputError: another `phase` or `time_origin`, or arrays that do not fit together.
     """
+    if time_origin not in get_args(TimeOrigin.__value__):
+        raise InputError("time_origin", "searched or ranged", repr(time_origin), "Correct the value")
     if phase != "per_packet":
         raise InputError("phase", "per_packet", repr(phase), 'Set phase = "per_packet" in [data]')
     shape = channel_shape(paths, subcarrier_frequency, channel=channel)
     room = traced_gain(paths, materials, law)
-    receiver = _receiver(shape[0], rough_delay)
+    receiver = _receiver(shape[0], rough_delay, time_origin)
     noiseless = _received(paths, subcarrier_frequency, room, receiver)
     noise = site("noise_power", _variance(paths, noise_power, link_power, model_error, shape[1]))
     observe(noiseless, noise, shape, channel)
@@ -156,15 +170,20 @@ def _variance(
     return jnp.broadcast_to(noise_power + error, (paths.n_link,)).reshape((-1, 1, 1, 1, 1))
 
 
-def _receiver(links: int, rough: jax.Array | None) -> _Receiver:
+def _receiver(links: int, rough: jax.Array | None, time_origin: TimeOrigin) -> _Receiver:
+    error: Any = dist.Normal(0.0, 1.0)
+    around, spread = 0.0 if rough is None else rough, _DELAY_SPREAD
+    if time_origin == "ranged":
+        offset: Any = numpyro.sample("ranging_offset", dist.Normal(0.0, 1.0))
+        around, spread = _RANGING_OFFSET[0] + _RANGING_OFFSET[1] * offset, _RANGING_SPREAD
+        error = dist.StudentT(_RANGING_TAIL, 0.0, 1.0)
     transmitted: Any = numpyro.sample("transmitted_power", dist.LogNormal(np.log(_TRANSMITTED), 1.0))
     saturated: Any = numpyro.sample("saturated_level", dist.LogNormal(np.log(_SATURATED), 0.5))
     with numpyro.plate("link", links, dim=-1):
         phase: Any = numpyro.sample("link_phase", unknown_phase())
-        delay: Any = numpyro.sample("link_delay", dist.Normal(0.0, 1.0))
+        delay: Any = numpyro.sample("link_delay", error)
         log_gain: Any = numpyro.sample("link_gain", dist.Normal(0.0, 1.0))
-    around = 0.0 if rough is None else rough
-    return _Receiver(phase, around + _DELAY_SPREAD * delay, _GAIN_SPREAD * log_gain, transmitted, saturated)
+    return _Receiver(phase, around + spread * delay, _GAIN_SPREAD * log_gain, transmitted, saturated)
 
 
 def _pulse(subcarrier_frequency: jax.Array) -> jax.Array:

@@ -29,10 +29,12 @@ def traced(paths):
     return np.asarray(field.synthesize(gain, response))[:, 0, 0, 0]
 
 
-def at(paths, **values):
+def at(paths, options=None, **values):
     """The sites with materials as traced, a flat pulse and a receiver on its law, but for `values`."""
     n = paths.n_link
-    data = {"paths": paths, "subcarrier_frequency": jnp.asarray(FREQUENCY), "materials": "known"}
+    data = {"paths": paths, "subcarrier_frequency": jnp.asarray(FREQUENCY), "materials": "known"} | (
+        options or {}
+    )
     null = {"link_phase": n, "link_delay": n, "link_gain": n, "pulse_log_gain": 8, "pulse_phase": 7}
     start = {name: jnp.zeros(size) for name, size in null.items()}
     start |= {"transmitted_power": jnp.asarray(1e-5), "saturated_level": jnp.asarray(1e-11)}
@@ -60,6 +62,21 @@ def test_each_link_departs_in_gain_phase_and_delay(paths):
     )
     expected = plain[:, 0, 0, 0] * factor
     np.testing.assert_allclose(sites["noiseless_channel"][:, 0, 0, 0], expected, rtol=1e-9)
+
+
+def test_a_ranged_origin_does_not_look_at_the_twin(paths):
+    late = {"rough_delay": jnp.full(5, 7e-9)}
+    assert np.allclose(at(paths, late)["receiver_delay"], 7e-9)
+    ranged = late | {"time_origin": "ranged"}
+    delay = np.array([0.0, 0, 2, -1, 1])
+    sites = at(paths, ranged, ranging_offset=jnp.asarray(0.5), link_delay=delay)
+    np.testing.assert_allclose(sites["receiver_delay"], 2.5e-9 + 0.6e-9 * delay, rtol=1e-6)
+    measured = {"channel": jnp.zeros((5, 1, 1, 1, 48), complex)}
+    data = {"paths": paths, "subcarrier_frequency": jnp.asarray(FREQUENCY), **ranged, **measured}
+    found = declare(ultra_wideband_channel, data).sites
+    assert (found["link_delay"].distribution, found["ranging_offset"].distribution) == ("StudentT", "Normal")
+    with pytest.raises(InputError, match="searched or ranged"):
+        at(paths, {"time_origin": "range"})
 
 
 def test_the_pulse_weighs_all_links_alike(paths):
