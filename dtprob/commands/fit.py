@@ -7,7 +7,7 @@ from dtprob.case import Case
 from dtprob.commands.run import Run, chosen, infer, prepare_case, session
 from dtprob.files import write_text
 from dtprob.workflow.identified import contraction
-from dtprob.workflow.summary import summarise, summarised
+from dtprob.workflow.summary import entry_names, summarise, summarised
 
 
 def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code: bool, resume: bool) -> None:
@@ -30,6 +30,8 @@ def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code:
         known = contraction(posterior, prepared.model, prepared.data, summarised(posterior))
         summary = summarise(posterior, known)
         summary["provenance"] |= prepared.provenance
+        if names := entry_names(prepared.data):
+            summary["names"] = names
         write_text(out / "summary.json", json.dumps(summary, indent=2, allow_nan=False) + "\n")
         for warning in summary["warnings"]:
             say(warning)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from dtprob.inference import Posterior, summary
+from dtprob.raytracing.paths import PathSet
 from dtprob.workflow.identified import UNIDENTIFIED
 
 LARGEST = 1000
@@ -54,6 +55,20 @@ def summarised(posterior: Posterior) -> list[str]:
     """The latent sites with few enough entries to tell of each."""
     sizes = {name: int(np.prod(posterior.draws[name].shape[2:])) for name in posterior.latent}
     return [name for name, size in sizes.items() if size <= LARGEST]
+
+
+def entry_names(data: Mapping[str, Any]) -> dict[str, list[str]]:
+    """What the entries of materials and objects in a posterior are called, in their order; empty without a scene.
+
+    Args:
+        data: the model's arguments.
+    """
+    paths = data.get("paths")
+    if not isinstance(paths, PathSet):
+        return {}
+    own = {"per_object": paths.object_names, "shared": ("all objects",), "known": ()}
+    materials = own.get(data.get("materials", "per_material"), paths.material_names)
+    return {"material": list(materials), "object": list(paths.object_names)}
 
 
 def _by_label(contractions: Mapping[str, np.ndarray]) -> dict[str, float]:

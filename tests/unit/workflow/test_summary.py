@@ -1,11 +1,15 @@
 """summary.json: what is doubtful is said in a sentence, and nothing in it is NaN."""
 
 import json
+from pathlib import Path
 
 import numpy as np
 
 from dtprob.inference import Posterior
+from dtprob.raytracing import storage
 from dtprob.workflow import summary
+
+DEMO = Path(__file__).parents[3] / "dtprob" / "data" / "demo"
 
 
 def posterior(**draws: np.ndarray) -> Posterior:
@@ -50,3 +54,11 @@ def test_one_chain_and_large_sites():
     assert "rhat" not in found["parameters"]["a"]
     assert found["warnings"] == []
     json.dumps(found, allow_nan=False)
+
+
+def test_entries_of_materials_have_names():
+    paths = storage.load(DEMO / "paths.nc")
+    names = summary.entry_names({"paths": paths})
+    assert names == {"material": list(paths.material_names), "object": list(paths.object_names)}
+    assert summary.entry_names({"paths": paths, "materials": "per_object"})["material"] == names["object"]
+    assert summary.entry_names({"buffer": 1}) == {}
