@@ -126,7 +126,8 @@ def score(answers: Path, key: Path) -> None:
 
     content = _json(key)
     names = [str(case.get("name")) for case in content.get("cases", [])]
-    there = [name for name in names if (answers / name).is_dir()]
+    ended = ("report.json", "error.txt")  # without either the case was broken off
+    there = [name for name in names if any((answers / name / file).is_file() for file in ended)]
     files = ("report.json", "timing.json", "rivals.json")
     reports, timings, rivals = ({name: _optional(answers / name / file) for name in there} for file in files)
     seconds = {name: timing["seconds"] for name, timing in timings.items() if timing}

@@ -81,6 +81,14 @@ def test_the_score(answered, capsys):
     assert (answered / "answers" / "score.html").stat().st_size > 2000
 
 
+def test_a_case_that_was_broken_off_is_missing(answered, tmp_path):
+    folder = tmp_path / "answers"
+    shutil.copytree(answered / "answers", folder)
+    (folder / "0001" / "report.json").unlink()
+    assert main(["withheld", "score", str(folder), "--key", str(answered / "key.json")]) == 0
+    assert json.loads((folder / "score.json").read_text())["missing"] == ["0001"]
+
+
 def test_resume_keeps_answers(answered):
     file = answered / "answers" / "0000" / "report.json"
     before = file.stat().st_mtime_ns
