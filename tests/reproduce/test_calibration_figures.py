@@ -1,15 +1,20 @@
 """Figures of calibration in small: the toy with one wall misplaced, and the parts of the urban study."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy import integrate, special
 
+from dtprob.errors import InputError
+from dtprob.physical import tracing
 from dtprob.physical.channel import subcarriers
 from dtprob.raytracing.field import frequency_response, path_gain, synthesize
+from dtprob.raytracing.trace import load_scene
 from dtprob.raytracing.walls import between_walls
-from dtprob.reproduce import FIGURES, calibration_urban, fig5
+from dtprob.reproduce import FIGURES, calibration_urban, fig5, fig7
 from dtprob.reproduce.progress import Progress
 
 
@@ -54,3 +59,40 @@ def test_quantiles_at_the_ends():
 
 def test_figures_of_calibration_are_offered():
     assert {"fig5", "fig6a", "fig6b", "fig7"} <= set(FIGURES)
+
+
+@pytest.mark.libllvm
+def test_displaced_receivers_traced_afresh_see_what_images_say(street_corner):
+    """Over half a wavelength the list of paths, their gains and directions hardly change; their phases do."""
+    place = dataclasses.replace(calibration_urban.world(1), rays=calibration_urban.DISPLACED_RAYS)
+    truth = calibration_urban.Truth(place, tracing.trace(place))
+    displacement = np.array([[0.0, 0.0, 0.0], [0.02, 0.01, -0.01]])
+    found = calibration_urban.displaced(truth, displacement)
+    rays = truth.rays.shifted(displacement[None])
+    tones = calibration_urban.FREQUENCY + calibration_urban.sounding().subcarrier_frequency
+    phasors = np.exp(-2j * np.pi * np.modf(rays.delay[0, :, :, None] * tones)[0])
+    expected = np.einsum("p,spk->sk", truth.rays.gain[0, 0], phasors)
+    apart = np.linalg.norm(found - expected, axis=1) / np.linalg.norm(expected, axis=1)
+    assert np.all(apart < [1e-6, 5e-3])
+    assert np.linalg.norm(found[1] - found[0]) > 0.1 * np.linalg.norm(found[0])
+
+
+@pytest.mark.libllvm
+def test_cells_that_rays_cross_are_where_paths_are(street_corner, monkeypatch):
+    monkeypatch.setattr(fig7, "CELL", 20.0)
+    monkeypatch.setattr(fig7, "SEARCH_RAYS", 500_000)
+    crossed, cells = fig7.crossed(street_corner), fig7.cells()
+    assert crossed.shape == (len(cells),)
+    here = np.all(np.abs(cells[:, :2] - calibration_urban.RECEIVER[:2]) <= 10.0, axis=1)
+    assert crossed[here].all()
+    assert 0.1 < crossed.mean() < 0.7
+    assert list(street_corner.transmitters) == []
+
+
+@pytest.fixture(scope="module")
+def street_corner():
+    """The scene of figures 6 and 7, or a skip where it cannot be loaded."""
+    try:
+        return load_scene(calibration_urban.SCENE, calibration_urban.FREQUENCY)
+    except InputError as error:
+        pytest.skip(str(error))
