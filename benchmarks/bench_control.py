@@ -1,28 +1,32 @@
 """Environment and training slots per second: dtprob's compiled network against a plain NumPy PettingZoo environment.
 
-    python benchmarks/bench_control.py [--environments 1000] [--slots 200] [--rounds 5] [--write]
+    python benchmarks/bench_control.py [--environments 1000] [--slots 200] [--rounds 5] [--torch PYTHON] [--write]
 
-The rival plays the same network one slot at a time, as PettingZoo environments do, with uniform numbers drawn in
-blocks; both play ALOHA(1/2), in turns in one process, and both must deliver the same. Rates are per second of processor
-time, of all threads together, so that other work on the machine hardly counts. "rbg" is the same with keys of JAX's
-other generator. Training is COMA with members side by side; it has no rival here. The last lines say how the cost of a
-slot grows with the number of devices.
+The rival plays the same network one slot at a time, as PettingZoo environments do (plain_network.py); both play
+ALOHA(1/2), in turns in one process, and both must deliver the same. Rates are per second of processor time, of all
+threads together, so that other work on the machine hardly counts. "rbg" is the same with keys of JAX's other generator.
+Training is COMA with members side by side. --torch names the interpreter of an environment with torch and pettingzoo
+(dependency group `rivals`), in which the same COMA trains on the plain network (rival_torch.py), in turns with ours;
+compilation is not counted. The last lines say how the cost of a slot grows with the number of devices.
 --write keeps the figures in benchmarks/results/control.json.
 """
 
 import argparse
+import functools
 import json
+import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable
-from typing import ClassVar
+from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from gymnasium.spaces import Box, Discrete
-from pettingzoo import ParallelEnv
+from plain_network import PlainNetwork
 from record import record
 
 from dtprob.control import COMA, Budget, Environment, FramePolicy, aloha, evaluate, train
@@ -30,6 +34,8 @@ from dtprob.physical.multi_access import Network, PhysicalKernel
 
 SENDS = 0.5
 DEVICES = (4, 8, 16, 32, 64)
+TRAINING = 40_000
+"""Virtual slots of a training."""
 
 
 def main() -> None:
@@ -39,10 +45,11 @@ def main() -> None:
     compare(ours()[1], theirs()[1])
     other = compiled(Network.reference(), options, "rbg")
     rates = in_turns({"dtprob": ours, "dtprob_rbg": other, "numpy": theirs}, options.rounds)
-    figures = {
+    figures: dict[str, Any] = {
+        "settings": {k: v for k, v in vars(options).items() if k not in ("write", "torch")},
         "environment_slots_per_processor_second": rates,
         "ratio": {name: rates[name] / rates["numpy"] for name in ("dtprob", "dtprob_rbg")},
-        "training_slots_per_processor_second": training(options.members),
+        **training(options),
         "processor_microseconds_per_slot_by_devices": {
             str(k): 1e6 / in_turns({"dtprob": compiled(Network.pairs(k // 2), options)}, 3)["dtprob"]
             for k in DEVICES
@@ -50,7 +57,9 @@ def main() -> None:
     }
     print(json.dumps(figures, indent=1))
     if options.write:
-        write(options, figures)
+        record(
+            "control", "slots of a network per second, and COMA's", ["jax", "numpy", "pettingzoo"], figures
+        )
 
 
 def arguments() -> argparse.Namespace:
@@ -58,6 +67,7 @@ def arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(description="Environment and training slots per second.")
     for name, default in (("environments", 1000), ("slots", 200), ("rounds", 5), ("members", 10)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--torch", metavar="PYTHON")
     parser.add_argument("--write", action="store_true")
     return parser.parse_args()
 
@@ -83,76 +93,9 @@ def compiled(
     return run
 
 
-class PlainNetwork(ParallelEnv):
-    """The same network in plain NumPy, as one would write it for PettingZoo."""
-
-    metadata: ClassVar[dict] = {"name": "plain_v0"}
-
-    def __init__(self, network: Network) -> None:
-        self.network = network
-        self.possible_agents = [f"device_{number}" for number in range(network.devices)]
-        self._seen = Box(0, 2000, (4,), np.int64)
-        self._acts = Discrete(2)
-        self._arrival = [row[0].cumsum().tolist() for row in network.arrival]
-        self._reception = [row.cumsum().tolist() for row in network.reception]
-
-    def observation_space(self, agent: str) -> Box:
-        """Buffer, arrival, acknowledgement, slot."""
-        del agent
-        return self._seen
-
-    def action_space(self, agent: str) -> Discrete:
-        """Silence or sending."""
-        del agent
-        return self._acts
-
-    def reset(self, seed: int | None = None, options: dict | None = None) -> tuple[dict, dict]:
-        """Empty buffers."""
-        del options
-        self.random = np.random.default_rng(seed)
-        self.uniform: list[list[float]] = []
-        self.agents = list(self.possible_agents)
-        self.buffer = [0] * len(self.agents)
-        self.slot = 0
-        return dict.fromkeys(self.agents, (0, 0, 0, 0)), {agent: {} for agent in self.agents}
-
-    def step(self, actions: dict) -> tuple[dict, dict, dict, dict, dict]:
-        """One slot."""
-        if not self.uniform:
-            self.uniform = self.random.random((1000, 1 + len(self.agents) + len(self._arrival))).tolist()
-        uniform = self.uniform.pop()
-        buffer, agents, capacity = self.buffer, self.agents, self.network.capacity
-        senders = [i for i, agent in enumerate(agents) if actions[agent] and buffer[i]]
-        count = sum(uniform[0] >= edge for edge in self._reception[len(senders)])
-        ack = [0] * len(agents)
-        for i in sorted(senders, key=lambda i: uniform[1 + i])[:count]:
-            ack[i] = 1
-        arrival = [0] * len(agents)
-        for number, (cluster, edges) in enumerate(zip(self.network.clusters, self._arrival, strict=True)):
-            outcome = sum(uniform[1 + len(agents) + number] >= edge for edge in edges)
-            for place, device in enumerate(reversed(cluster)):
-                arrival[device] = outcome >> place & 1
-        reward = 0.0
-        for i in range(len(agents)):
-            full = buffer[i] + arrival[i] - ack[i]
-            reward += 50 if ack[i] else -50 if full > capacity else -1
-            buffer[i] = min(full, capacity)
-        self.slot += 1
-        done = self.slot >= 2000
-        seen = {agent: (buffer[i], arrival[i], ack[i], self.slot) for i, agent in enumerate(agents)}
-        self.delivered = count
-        return (
-            seen,
-            dict.fromkeys(agents, reward),
-            dict.fromkeys(agents, False),
-            dict.fromkeys(agents, done),
-            {agent: {} for agent in agents},
-        )
-
-
 def plain(network: Network, slots: int) -> Callable[[], tuple[int, float]]:
     """Plays one plain environment; gives slots played and packets delivered per slot."""
-    environment = PlainNetwork(network)
+    environment = PlainNetwork(network.clusters, network.capacity, network.arrival[:, 0], network.reception)
     seeds = iter(range(10**6))
 
     def run() -> tuple[int, float]:
@@ -185,32 +128,65 @@ def in_turns(runs: dict[str, Callable[[], tuple[int, float]]], rounds: int) -> d
     return {name: float(np.median(values)) for name, values in rates.items()}
 
 
-def training(members: int) -> float:
-    """Training slots per second of processor time of COMA on the reference network, compilation apart."""
-    environment, learner, budget = world(Network.reference()), COMA(), Budget(40_000)
+def training(options: argparse.Namespace) -> dict[str, Any]:
+    """Training slots per second of processor time, in turns, and the reward that the trainings end with."""
+    runs = {"dtprob": trainer(options.members)}
+    if options.torch:
+        runs["torch"] = functools.partial(torch_training, options.torch)
+    found: dict[str, list[tuple[float, float]]] = {name: [] for name in runs}
+    for _ in range(options.rounds):
+        for name, run in runs.items():
+            found[name].append(run())
+    middle = {name: np.median(values, axis=0).tolist() for name, values in found.items()}
+    figures: dict[str, Any] = {
+        "training_slots_per_processor_second": {name: value[0] for name, value in middle.items()},
+        "reward_per_slot_at_the_end": {name: value[1] for name, value in middle.items()},
+    }
+    if options.torch:
+        figures["training_ratio"] = middle["dtprob"][0] / middle["torch"][0]
+    return figures
+
+
+def trainer(members: int) -> Callable[[], tuple[float, float]]:
+    """Trains members side by side; compiled before."""
+    environment, learner, budget = world(Network.reference()), COMA(), Budget(TRAINING)
+    last = budget.updates // 10
 
     @eqx.filter_jit
     def fit(keys: jax.Array) -> jax.Array:
         def one(key: jax.Array) -> jax.Array:
-            return train(key, learner, FramePolicy(key, 4), environment, budget).reward[-1]
+            return train(key, learner, FramePolicy(key, 4), environment, budget).reward[-last:].mean()
 
         return jax.vmap(one)(keys)
 
-    keys = jax.random.split(jax.random.key(0), (3, members))
-    jax.block_until_ready(fit(keys[0]))
-    times: list[float] = []
-    for own in keys[1:]:
-        start = time.process_time()
-        jax.block_until_ready(fit(own))
-        times.append(time.process_time() - start)
-    return members * budget.slots / float(np.median(times))
+    keys = iter(jax.random.split(jax.random.key(0), (100, members)))
+
+    def run() -> tuple[float, float]:
+        own, start = next(keys), time.process_time()
+        reward = np.mean(fit(own))
+        return members * budget.slots / (time.process_time() - start), float(reward)
+
+    run()
+    return run
 
 
-def write(options: argparse.Namespace, figures: dict) -> None:
-    """Keep the figures."""
-    settings = {k: v for k, v in vars(options).items() if k != "write"}
-    what = "environment steps per second, and training of policies"
-    record("control", what, ("jax", "numpy", "pettingzoo"), {"settings": settings, **figures})
+def torch_training(interpreter: str) -> tuple[float, float]:
+    """The rival's training, in its own environment."""
+    network = Network.reference()
+    with tempfile.TemporaryDirectory() as folder:
+        given, found = Path(folder) / "network.npz", Path(folder) / "found.npz"
+        np.savez(
+            given,
+            clusters=network.clusters,
+            capacity=network.capacity,
+            arrival=network.arrival[:, 0],
+            reception=network.reception,
+        )
+        script = Path(__file__).with_name("rival_torch.py")
+        subprocess.run([interpreter, str(script), str(given), str(found), str(TRAINING)], check=True)
+        with np.load(found) as file:
+            rate, reward = file["training"]
+            return float(rate), float(reward)
 
 
 if __name__ == "__main__":
