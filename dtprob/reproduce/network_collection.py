@@ -1,7 +1,8 @@
 """How fast data teach the reception of the network: collected at random, or by a policy trained to learn.
 
 The policy is trained by COMA on networks drawn from the prior, with the information of each slot about all tables as
-reward; it is a frame policy of 8 slots. It is judged on the real network.
+reward; it is a frame policy of 8 slots. It is judged on the real network, and beside what one hand could do that directs
+all devices and knows the network.
 """
 
 from collections.abc import Mapping, Sequence
@@ -16,6 +17,7 @@ from dtprob import control
 from dtprob.control import Budget, TablePolicy
 from dtprob.models.multi_access import Clusters, priors
 from dtprob.physical.multi_access import Network
+from dtprob.reproduce.collection_bound import least_errors
 from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
 from dtprob.reproduce.network_study import NETWORK, TWIN, collect, counts, law, record
 from dtprob.reproduce.progress import Progress
@@ -25,6 +27,8 @@ SLOTS: Final = 40
 CONCENTRATION: Final = 0.5
 """Of the prior. With that of control, 0.01, a row counts as known after a single outcome."""
 TARGETS: Final = (0.4, 0.3, 0.25, 0.2)
+BOUND: Final = 20
+"""Slots up to which the best central collector is computed."""
 FRAME: Final = 8
 BUDGET: Final = Budget(400_000, 40, SLOTS)
 
@@ -47,10 +51,16 @@ def figure(key: PRNGKeyArray, runs: int, progress: Progress, budget: Budget) -> 
         "optimised": errors(directed(play_key, table, runs)),
     }
     slots = np.arange(1, SLOTS + 1)
-    series = tuple(_mean(name, slots, value) for name, value in curves.items())
+    best = least_errors(NETWORK, CONCENTRATION, BOUND)[1:]
+    series = (
+        *(_mean(name, slots, value) for name, value in curves.items()),
+        Series("best_central", slots[:BOUND].astype(float), best, best, best),
+    )
     axes = Quantity("slots of data"), Quantity("error of the reception table")
     panel = Panel("posterior mean against the truth", *axes, series)
-    return Figure("collection", "collecting data that teach", (panel,), runs, (_MEASURE, *_steps(curves)))
+    return Figure(
+        "collection", "collecting data that teach", (panel,), runs, (_MEASURE, *_steps(curves, best))
+    )
 
 
 _MEASURE: Final = "error: total variation of the posterior mean from the truth, mean over 1 to 4 senders"
@@ -97,14 +107,18 @@ def _mean(name: str, slots: Sequence[int] | np.ndarray, values: Float[np.ndarray
     return Series(name, np.asarray(slots, float), mean, mean - 1.96 * error, mean + 1.96 * error)
 
 
-def _steps(curves: Mapping[str, Float[np.ndarray, "run slot"]]) -> tuple[str, ...]:
+def _steps(
+    curves: Mapping[str, Float[np.ndarray, "run slot"]], best: Float[np.ndarray, " slot"]
+) -> tuple[str, ...]:
     """Slots until the mean error is no larger than each target."""
+    means = {**{name: value.mean(axis=0) for name, value in curves.items()}, "best": best}
 
     def until(name: str, target: float) -> str:
-        below = np.flatnonzero(curves[name].mean(axis=0) <= target)
-        return str(below[0] + 1) if len(below) else f"more than {SLOTS}"
+        below = np.flatnonzero(means[name] <= target)
+        return str(below[0] + 1) if len(below) else f"more than {len(means[name])}"
 
     return tuple(
-        f"error {target}: {until('optimised', target)} slots, at random {until('random', target)}"
+        f"error {target}: {until('optimised', target)} slots, at random {until('random', target)}, "
+        f"the best central collector that knows the network {until('best', target)}"
         for target in TARGETS
     )

@@ -8,6 +8,7 @@ import pytest
 
 from dtprob.control import COMA, Budget, aloha
 from dtprob.reproduce import fig2, network_collection
+from dtprob.reproduce.collection_bound import expected_errors, least_errors
 from dtprob.reproduce.network_study import NETWORK, Campaign, collect, counts, law, learned, mode, record
 from dtprob.reproduce.progress import Progress
 
@@ -57,7 +58,8 @@ def test_points_are_the_textbooks():
 
 def test_the_figure_in_small(tmp_path):
     campaign = Campaign(COMA(), Budget(640, 8, 20), starts=0)
-    found = fig2.figure(KEY, 2, Progress(folder=tmp_path / "parts"), (0, 4), campaign)
+    with jax.enable_x64(False):  # as `run` does; one part asks for double precision
+        found = fig2.figure(KEY, 2, Progress(folder=tmp_path / "parts"), (0, 4), campaign)
     names = [series.name for series in found.panels[0].series]
     assert names == [*fig2.LINES, "oracle", "tdma", "aloha"]
     level = {series.name: series.median for series in found.panels[0].series}
@@ -76,3 +78,16 @@ def test_errors_fall_with_counts_and_are_zero_in_the_limit():
     uniform = [0.5, 1 - (1 / 3 + 0.2), 0.75, 0.8]
     assert empty[0, 0] == pytest.approx(np.mean(uniform))
     assert law(ZERO, 0.5).concentration["log_reception"][3].tolist() == [0.5] * 4 + [0.0]
+
+
+def test_the_best_collector_against_closed_forms_and_chance():
+    certain = expected_errors(NETWORK.reception[3, :4], 0.5, 3)
+    np.testing.assert_allclose(certain, 1.5 / (2 + np.arange(4)))
+    best = least_errors(NETWORK, 0.5, 8)
+    start = np.mean([0.5, 1 - (1 / 3 + 0.2), 0.75, 0.8])
+    np.testing.assert_allclose(best[:2], start, atol=1e-6)  # buffers are empty in the first slot
+    sent_by_one = (1 - 0.2**2) * (0.5 - 0.25) / 4  # what teaches most in the second, unless no packet came
+    assert best[2] == pytest.approx(start - sent_by_one, abs=1e-6)
+    chance = network_collection.errors(collect(KEY, 9, 400)).mean(axis=0)
+    assert np.all(np.diff(best[1:]) < 0)
+    assert np.all(best[1:] <= chance + 1e-6)
