@@ -74,7 +74,7 @@ def answer_of_rivals(case: Case, out: Path, *, seed: int | None, no_code: bool) 
     job = Run(out, resume=True, allow_code=not no_code, say=lambda _: None)
     prepared, reference = _ready(chosen(case, None, seed), job, ())
     problem = Problem(prepared.model, prepared.data, prepared.effects, prepared.cluster, reference)
-    found = compete(problem, jax.random.fold_in(prepared.key, 1), Settings())
+    found = compete(problem, jax.random.fold_in(prepared.key, 1), _settings(prepared))
     write_text(out / "rivals.json", json.dumps(found, indent=1))
 
 
@@ -87,6 +87,11 @@ def _ready(case: Case, job: Run, results: Sequence[str]) -> tuple[Prepared, Post
     return prepared, infer(prepared, prepared.reference, job.out / "reference.nc", job)
 
 
+def _settings(prepared: Prepared) -> Settings:
+    """The effort that the case asks for."""
+    return Settings(**dataclasses.asdict(prepared.case.diagnosis))
+
+
 def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tuple[dict[str, Any], DataTree]:
     """The content of report.json and of gap.nc."""
     job.say(f"{len(prepared.effects)} candidate effects")
@@ -97,7 +102,7 @@ def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tupl
         key=prepared.key,
         engine=prepared.engine,
         cluster=prepared.cluster,
-        settings=Settings(**dataclasses.asdict(prepared.case.diagnosis)),
+        settings=_settings(prepared),
         reference=reference,
         designs=prepared.designs,
         say=job.say,
