@@ -66,6 +66,7 @@ class SceneSection:
         device_height: m, added to the height of both ends of each link.
         ceiling_height: m, of the rooms of a floor plan.
         wall_material, wall_thickness: of the walls of a floor plan; thickness in m.
+        samples: rays shot from each end; fewer are faster and miss small or far surfaces.
         strongest: at most so many paths of each link are kept; None keeps all.
         check_depth: most interactions of a second trace, whose additional paths only the effect depth_cut_off uses.
         check_refraction: the same of a trace through walls, for refraction_off.
@@ -87,6 +88,7 @@ class SceneSection:
     ceiling_height: float | None = None
     wall_material: str = "brick"
     wall_thickness: float | None = None
+    samples: int = 1_000_000
     strongest: int | None = None
     check_depth: int | None = None
     check_refraction: bool = False

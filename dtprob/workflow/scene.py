@@ -23,6 +23,8 @@ from dtprob.raytracing.beyond import strongest, with_beyond
 from dtprob.raytracing.paths import PathSet
 
 _WALL_THICKNESS = 0.12
+_MOST_ELSEWHERE = 4
+"""The same from another transmitter's place."""
 _OTHER_DEPTH = 2
 """Most interactions on paths from another transmitter's place."""
 _APART = 1e-2
@@ -150,7 +152,11 @@ def _trace(scene: SceneSection, data: ChannelData | PowerData) -> PathSet:
     known = paths
     paths = paths if scene.strongest is None else strongest(paths, scene.strongest)
     for name, other in fuller.items():
-        paths = with_beyond(paths, name, other, scene.strongest or _MOST_BEYOND, known=known)
+        most = (
+            _MOST_BEYOND if name in {DEPTH, REFRACTION} else _MOST_ELSEWHERE,
+            scene.strongest or _MOST_BEYOND,
+        )
+        paths = with_beyond(paths, name, other, min(most), known=known)
     return paths
 
 
@@ -184,6 +190,7 @@ class _Traced(NamedTuple):
             tx_pattern=section.tx_pattern,
             rx_pattern=section.rx_pattern,
             polarization=section.polarization,
+            samples=section.samples,
             frequency=float(section.frequency or 0.0),
             allow_empty=True,
         )
