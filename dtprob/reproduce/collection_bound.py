@@ -5,7 +5,6 @@ whatever comes out. What it could still gain by looking at the outcomes is littl
 network is random at all; devices that decide alone and do not know the network do worse.
 """
 
-import itertools
 from math import comb
 from typing import Final
 
@@ -15,7 +14,7 @@ from scipy.stats import binom
 
 from dtprob.physical.multi_access import Network
 
-_PAIRS: Final = tuple(itertools.product(range(3), repeat=2))
+_PAIRS: Final = tuple((first, second) for first in range(3) for second in range(3))
 """Of the two pairs, how many devices send, or how many buffers are full."""
 
 
