@@ -21,5 +21,6 @@ FIGURES: Final[Mapping[str, str]] = {
     "fig10_learned": "dtprob.reproduce.fig10_learned",
     "label_grid": "dtprob.reproduce.label_grid",
     "deepsense": "dtprob.reproduce.deepsense",
+    "apartment": "dtprob.reproduce.apartment",
 }
 """For each figure's name, the module that makes it."""

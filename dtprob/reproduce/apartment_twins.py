@@ -1,0 +1,178 @@
+"""Wrong twins of the measured apartment: the measurements stay, what the twin believes about them is spoilt.
+
+A wrong twin is a CASE beside a copy of the measured set in which one of the files that describe the flat says something
+else: the floor plan, the table of links, the radio. `dtprob diagnose` reads it like any other case.
+"""
+
+import csv
+import json
+import shutil
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Final, NamedTuple
+
+from dtprob.data.location import measured_data
+from dtprob.data.uwb_apartment import NAME, RESPONSES
+from dtprob.files import write_text
+
+LINKS: Final = (1, 2, 3, 5, 6, 9, 12, 13, 14, 21, 34, 35, 36, 37, 40, 42, 43, 46, 48, 52, 56)
+"""Links that a path of two interactions or fewer reaches, in all rooms."""
+CARRIER: Final = 3.9936e9
+
+
+class Twin(NamedTuple):
+    """What a twin believes wrongly, and the effects that undo it.
+
+    Attributes:
+        name: of the twin.
+        wrong: in words.
+        undone_by: families, or instances, any of which is right; empty where nothing is wrong or where the unknown
+            parameters of the twin undo it themselves.
+        wall: number of the wall that the floor plan lacks.
+        anchor: for each anchor's number, the place (x, y) in m that the table of links gives instead.
+        bandwidth: factor on the radio's bandwidth, and on its tap's inverse.
+        scene: settings of [scene] that differ.
+    """
+
+    name: str
+    wrong: str
+    undone_by: tuple[str, ...] = ()
+    wall: int | None = None
+    anchor: Mapping[int, tuple[float, float]] = {}
+    bandwidth: float = 1.0
+    scene: Mapping[str, Any] = {}
+
+
+TWINS: Final = (
+    Twin("honest", "nothing on purpose"),
+    Twin(
+        "anchor_3",
+        "anchor 3 stands 0.5 m too far east",
+        ("transmitter_displacement[transmitter_7]",),
+        anchor={3: (8.37, 5.61)},
+    ),
+    Twin(
+        "swap_2_4",
+        "anchors 2 and 4 are taken for one another",
+        ("swapped_transmitters[4_5]",),
+        anchor={2: (5.99, 5.37), 4: (7.76, 6.79)},
+    ),
+    Twin("depth", "one interaction at most", ("depth_cut_off",), scene={"max_depth": 1, "check_depth": 2}),
+    Twin("wall_13", "the wall at x = 4.7 m, 3.6 m long, is not there", ("missing_object",), wall=13),
+    Twin("carrier", "the carrier is 4492.8 MHz", ("carrier_mismatch",), scene={"frequency": 4.4928e9}),
+    Twin("bandwidth", "the bandwidth is 599 MHz", ("bandwidth_mismatch",), bandwidth=1.2),
+    Twin(
+        "opaque",
+        "no wave passes a wall",
+        ("refraction_off",),
+        scene={"refraction": False, "check_refraction": True, "max_depth": 2},
+    ),
+    Twin("plaster", "walls are of plasterboard", scene={"wall_material": "plasterboard"}),
+    Twin(
+        "anchor_6",
+        "anchor 6 stands 0.5 m too far south",
+        ("transmitter_displacement[transmitter_3]",),
+        anchor={6: (3.34, 1.85)},
+    ),
+    Twin(
+        "swap_5_6",
+        "anchors 5 and 6 are taken for one another",
+        ("swapped_transmitters[2_3]",),
+        anchor={5: (3.34, 2.35), 6: (3.15, 0.9)},
+    ),
+    Twin("wall_5", "the wall at y = 4.8 m, 4.6 m long, is not there", ("missing_object",), wall=5),
+    Twin(
+        "anchor_5",
+        "anchor 5 stands 0.5 m too far west",
+        ("transmitter_displacement[transmitter_2]",),
+        anchor={5: (2.65, 0.9)},
+    ),
+    Twin("wall_2", "the wall at y = 3.4 m, 3.0 m long, is not there", ("missing_object",), wall=2),
+)
+"""The honest twin first."""
+
+EFFECTS: Final = (
+    *("transmitter_displacement", "receiver_displacement", "scene_scale", "swapped_transmitters"),
+    *("carrier_mismatch", "bandwidth_mismatch", "missing_object", "missing_path[line_of_sight]"),
+    *("missing_path[reflection]", "polarization_mismatch", "wall_law", "depth_cut_off"),
+)
+"""Candidates of every twin; refraction_off only where the twin lets nothing through walls."""
+
+LEFT_OUT: Final = ("receiver_displacement[each_link]", "transmitter_displacement[each_link]")
+"""Random fields that imitate any error of the geometry: the honest twin calls for the first."""
+
+
+def write_case(twin: Twin, folder: Path) -> Path:
+    """Write a twin's CASE and its copy of the measured set; the name of the CASE.
+
+    Args:
+        twin: what is wrong with it.
+        folder: receives case.toml and the folder of the set.
+
+    Raises:
+        InputError: the measured set is not there.
+    """
+    source, target = measured_data(NAME), folder / NAME
+    target.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(source / RESPONSES, target / RESPONSES)
+    write_text(target / "links.csv", _links(source / "links.csv", twin))
+    write_text(target / "floorplan.json", _plan(source / "floorplan.json", twin))
+    write_text(target / "radio.json", _radio(source / "radio.json", twin))
+    write_text(folder / "case.toml", _case(twin))
+    return folder / "case.toml"
+
+
+def _links(source: Path, twin: Twin) -> str:
+    with source.open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    for row in rows:
+        if int(row["anchor"]) in twin.anchor:
+            row["anchor_x"], row["anchor_y"] = (f"{x:g}" for x in twin.anchor[int(row["anchor"])])
+    return "\n".join([",".join(rows[0]), *(",".join(row.values()) for row in rows), ""])
+
+
+def _plan(source: Path, twin: Twin) -> str:
+    plan = json.loads(source.read_text())
+    if twin.wall is not None:
+        del plan["walls_xyxy"][twin.wall]
+    return json.dumps(plan, indent=1)
+
+
+def _radio(source: Path, twin: Twin) -> str:
+    radio = json.loads(source.read_text())
+    radio["bandwidth_hz"] *= twin.bandwidth
+    radio["tap_s"] /= twin.bandwidth
+    return json.dumps(radio, indent=1)
+
+
+def _case(twin: Twin) -> str:
+    scene = {
+        "file": f"{NAME}/floorplan.json",
+        "frequency": CARRIER,
+        "max_depth": 2,
+        "refraction": True,
+        "merge_shapes": False,
+        "skip_unreached": True,
+        "device_height": 1.2,
+        "ceiling_height": 2.6,
+        "wall_material": "brick",
+        "wall_thickness": 0.12,
+        "samples": 100_000,
+        "strongest": 6,
+        "check_depth": 3,
+        "check_transmitters": True,
+        **twin.scene,
+    }
+    use = [*EFFECTS, *(["refraction_off"] if not scene["refraction"] else [])]
+    sections: dict[str, Mapping[str, Any]] = {
+        "model": {"name": "ultra_wideband_channel"},
+        "model.options": {"time_origin": "ranged", "model_error": 0.5},
+        "data": {"file": NAME, "phase": "per_packet"},
+        "data.options": {"averages": 2, "level": "reported", "links": list(LINKS)},
+        "scene": scene,
+        "effects": {"use": use, "exclude": list(LEFT_OUT)},
+    }
+    lines = [f"# A twin of the measured apartment; wrong: {twin.wrong}."]
+    for name, content in sections.items():
+        lines += [f"[{name}]", *(f"{key} = {json.dumps(value)}" for key, value in content.items()), ""]
+    return "\n".join(lines)
