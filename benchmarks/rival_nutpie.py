@@ -1,8 +1,9 @@
-"""The phase-error channel of bench_nuts.py in PyMC, sampled by nutpie; run by that script in an environment of its own.
+"""The models of bench_nuts.py in PyMC, sampled by nutpie; run by that script in an environment of its own.
 
-    python benchmarks/rival_nutpie.py data.npz draws.npz
+    python benchmarks/rival_nutpie.py MODEL data.npz draws.npz
 
-Writes the draws of the material parameters and the processor and wall seconds of sampling, and of compiling.
+MODEL is channel or multi-access. Writes the draws of what is compared, (quantity, chain, draw), and the processor and
+wall seconds of sampling, and of compiling.
 """
 
 import sys
@@ -51,21 +52,47 @@ def channel(data: Any) -> Any:
     return model
 
 
+def materials(posterior: Any) -> np.ndarray:
+    """Permittivity and conductivity."""
+    return np.stack([1 + posterior["contrast"].values, posterior["conductivity"].values])
+
+
+def multi_access(data: Any) -> Any:
+    """The tables, written as the formulas stand: slot by slot."""
+    with pm.Model() as model:
+        arrival = pm.Dirichlet("arrival", np.ones(4), shape=(2, 4))
+        rows = [pm.Dirichlet(f"reception_{n}", np.ones(n + 1)) for n in range(1, 5)]
+        padded = [pt.concatenate([row, np.zeros(4 - n)]) for n, row in enumerate(rows, start=1)]
+        table = pt.stack([pt.as_tensor_variable(np.eye(5)[0]), *padded])
+        for k in range(2):
+            pm.Categorical(f"arrivals_{k}", arrival[k], observed=data["arrivals"][:, k])
+        pm.Categorical("deliveries", table[data["senders"]], observed=data["deliveries"])
+    return model
+
+
+def tables(posterior: Any) -> np.ndarray:
+    """The first entry of each row."""
+    arrival = np.moveaxis(posterior["arrival"].values[..., 0], 2, 0)
+    return np.stack([*arrival, *(posterior[f"reception_{n}"].values[..., 0] for n in range(1, 5))])
+
+
+MODELS = {"channel": (channel, materials), "multi-access": (multi_access, tables)}
+
+
 def main() -> None:
     """Compile, sample, write."""
-    data = np.load(sys.argv[1])
+    model, quantities = MODELS[sys.argv[1]]
+    data = np.load(sys.argv[2])
     begin = time.process_time(), time.monotonic()
-    compiled = nutpie.compile_pymc_model(channel(data))
+    compiled = nutpie.compile_pymc_model(model(data))
     middle = time.process_time(), time.monotonic()
     settings = {"tune": 500, "draws": 500, "chains": 2, "cores": 2, "progress_bar": False}
     trace = nutpie.sample(compiled, seed=1, **settings)
     end = time.process_time(), time.monotonic()
-    posterior, stats = trace.posterior, trace.sample_stats
     np.savez(
-        sys.argv[2],
-        permittivity=1 + posterior["contrast"].values,
-        conductivity=posterior["conductivity"].values,
-        steps=stats["n_steps"].values.mean(),
+        sys.argv[3],
+        draws=quantities(trace.posterior),
+        steps=trace.sample_stats["n_steps"].values.mean(),
         sampling=np.subtract(end, middle),
         compiling=np.subtract(middle, begin),
     )
