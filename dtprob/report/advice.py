@@ -56,6 +56,13 @@ ADVICE: Mapping[str, str] = {
     "noise_level": "set the noise power of the twin to the estimate",
     "noise_imbalance": "give each receiving chain the estimated noise power",
     "error_vector_magnitude": "add noise in proportion to the signal, with the estimated ratio",
+    "depth_cut_off": "raise max_depth and trace again",
+    "refraction_off": "switch refraction on when tracing",
+    "wall_law": "set the law of the walls to the other one",
+    "swapped_transmitters": "exchange the places of the two transmitters and trace again",
+    "carrier_mismatch": "correct the carrier by the estimated offset and trace again",
+    "bandwidth_mismatch": "correct the spacing of the subcarriers by the estimated factor",
+    "missing_object": "put a wall there into the scene and trace again",
     # network
     "device_disconnected": "take the device out of the twin",
     "arrival_rate_shift": "set the packet arrival rate to the estimate",
