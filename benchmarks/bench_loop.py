@@ -1,26 +1,20 @@
 """What the run loop costs beside the samplers themselves, and many small posteriors at once against one by one.
 
-    python benchmarks/bench_loop.py [--rounds 5] [--sites 1000] [--alone 30] [--engine NAME ...] [--write]
+    python benchmarks/bench_loop.py [--rounds 5] [--sites 1000] [--alone 30] [--part loop laplace hmc nuts] [--write]
 
 Loop: a logistic regression of 50 coefficients on 2,000 rows, the default 4 chains of 1,000 + 1,000 steps. Direct is the
 kernel of NumPyro or of BlackJAX in one compiled loop with the same keys, so that both make the same trajectories; the
 run loop adds chunks, statistics, the layout of the posterior and its provenance.
-Sites: a line with unknown noise through 12 points at each of many places, by Laplace's method and by NUTS (200 + 200
-steps, 2 chains): `fit_each` against `fit` for some of them, its time scaled to all.
+Sites: a line with unknown noise through 12 points at each of many places, by Laplace's method and by chains (200 + 200
+steps, 2 chains): `fit_each` with laplace, hmc or nuts against `fit` with laplace or nuts for some of them, its time
+scaled to all. Of chains the effective draws of a place are compared too: the least of its unknowns, median over places.
 Processor time, compiled before, in turns within one process; medians. --write keeps the figures in
 benchmarks/results/loop.json.
 """
 
 import argparse
-import datetime as dt
-import json
-import platform
-import shlex
-import sys
 import time
-from collections.abc import Callable
-from importlib.metadata import version
-from pathlib import Path
+from collections.abc import Callable, Iterable
 from typing import Any
 
 from dtprob.xla import avoid_miscompilation
@@ -32,20 +26,25 @@ import jax.numpy as jnp  # noqa: E402
 import numpy as np  # noqa: E402
 import numpyro  # noqa: E402
 import numpyro.distributions as dist  # noqa: E402
+from arviz_stats.base import array_stats  # noqa: E402
+from record import record, recorded  # noqa: E402
 
-from dtprob.inference import NUTS, BlackJAXNUTS, RunOptions, fit, fit_each  # noqa: E402
+from dtprob.inference import NUTS, BlackJAXNUTS, Posterior, RunOptions, fit, fit_each  # noqa: E402
 from dtprob.inference.build import build_target  # noqa: E402
 from dtprob.inference.chains import START, STEP  # noqa: E402
 from dtprob.inference.kernel import Place  # noqa: E402
 from dtprob.inference.target import Inputs, Target  # noqa: E402
 
-FILE = Path(__file__).parent / "results" / "loop.json"
 LEAN = RunOptions(pointwise=False, deterministics=False)
 STEPS: dict[str, Any] = {"warmup": 1000, "draws": 1000, "chains": 4}
+CHAINS: dict[str, Any] = {"warmup": 200, "draws": 200, "chains": 2}
 SHORT: dict[str, dict[str, Any]] = {
-    "laplace": {"draws": 400},
-    "nuts": {"warmup": 200, "draws": 200, "chains": 2},
+    "laplace": {"engine": "laplace", "draws": 400},
+    "hmc": {"engine": "hmc", **CHAINS},
+    "nuts": {"engine": "nuts", **CHAINS},
 }
+ALONE = {"laplace": "laplace", "hmc": "nuts", "nuts": "nuts"}
+"""What one would use for one place alone."""
 
 
 def regression(x: Any, y: Any = None) -> None:
@@ -69,15 +68,12 @@ def main() -> None:
     """Run the benchmark and print its figures."""
     options = arguments()
     jax.config.update("jax_enable_x64", True)
-    rows: list[dict[str, Any]] = []
-    for kind in (NUTS, BlackJAXNUTS):
-        rows.append(loop(kind, options.rounds))
-        print(rows[-1], flush=True)
-    for engine in options.engine:
-        rows.append(sites(engine, options))
-        print(rows[-1], flush=True)
-    if options.write:
-        write(rows)
+    for part in options.part:
+        kinds = (NUTS, BlackJAXNUTS)
+        rows = [loop(kind, options.rounds) for kind in kinds] if part == "loop" else [sites(part, options)]
+        print(*rows, sep="\n", flush=True)
+        if options.write:
+            write(rows)
 
 
 def arguments() -> argparse.Namespace:
@@ -87,7 +83,8 @@ def arguments() -> argparse.Namespace:
     )
     for name, default in (("rounds", 5), ("sites", 1000), ("alone", 30)):
         parser.add_argument(f"--{name}", type=int, default=default)
-    parser.add_argument("--engine", nargs="+", choices=SHORT, default=list(SHORT))
+    parts = ["loop", *SHORT]
+    parser.add_argument("--part", nargs="+", choices=parts, default=parts)
     parser.add_argument("--write", action="store_true")
     return parser.parse_args()
 
@@ -146,11 +143,11 @@ def sites(engine: str, options: argparse.Namespace) -> dict[str, Any]:
     keys = [jax.random.fold_in(key, i) for i in range(options.alone)]
 
     def together() -> Any:
-        return fit_each(place, {"x": x, "y": y}, ["y"], key=key, engine=engine, options=LEAN, **SHORT[engine])
+        return fit_each(place, {"x": x, "y": y}, ["y"], key=key, options=LEAN, **SHORT[engine])
 
     def alone() -> list[Any]:
         return [
-            fit(place, {"x": x, "y": y[i]}, engine=engine, key=keys[i], options=LEAN, **SHORT[engine])
+            fit(place, {"x": x, "y": y[i]}, key=keys[i], options=LEAN, **SHORT[ALONE[engine]])
             for i in range(options.alone)
         ]
 
@@ -162,14 +159,34 @@ def sites(engine: str, options: argparse.Namespace) -> dict[str, Any]:
     times = in_turns({"fit_each": together, "fit": alone}, options.rounds)
     scale = options.sites / options.alone
     ratios = [scale * a / b for a, b in zip(times["fit"], times["fit_each"], strict=True)]
+    draws = {} if engine == "laplace" else effective(ours, theirs)
     return {
-        "what": f"{options.sites} places with {engine}, {options.alone} of them one by one",
+        "what": f"{options.sites} places with {engine}",
+        "one_by_one": {"engine": ALONE[engine], "places": options.alone},
         "largest_difference_of_means_in_sd": round(float(np.max(np.abs(errors))), 3),
         "seconds": {
             "fit_each": round(float(np.median(times["fit_each"])), 3),
             "fit_scaled_to_all": round(float(np.median(times["fit"])) * scale, 2),
         },
         "ratio": round(float(np.median(ratios)), 1),
+        **draws,
+    }
+
+
+def effective(ours: Posterior, theirs: list[Posterior]) -> dict[str, Any]:
+    """Effective draws of a place, from all places at once and one by one."""
+    stats: Any = array_stats
+
+    def least(draws: Iterable[np.ndarray]) -> float:
+        return min(float(stats.ess(values, chain_axis=0, draw_axis=1)) for values in draws)
+
+    together = [least(ours.draws[name][..., i] for name in ours.latent) for i in range(len(theirs))]
+    alone = [least(one.draws[name] for name in one.latent) for one in theirs]
+    return {
+        "effective_draws": {
+            "fit_each": round(float(np.median(together))),
+            "fit": round(float(np.median(alone))),
+        }
     }
 
 
@@ -185,17 +202,12 @@ def in_turns(functions: dict[str, Callable[[], Any]], rounds: int) -> dict[str, 
 
 
 def write(rows: list[dict[str, Any]]) -> None:
-    """Keep the figures with what it takes to repeat them."""
-    result = {
-        "benchmark": "processor time of the run loop against the kernels alone; many posteriors at once",
-        "command": shlex.join(["python", "benchmarks/bench_loop.py", *sys.argv[1:]]),
-        "date": dt.datetime.now(dt.UTC).date().isoformat(),
-        "machine": f"{platform.machine()}, 2 shared CPU cores, no GPU",
-        "versions": {name: version(name) for name in ("jax", "numpyro", "blackjax")},
-        "rows": rows,
-    }
-    FILE.write_text(json.dumps(result, indent=2) + "\n")
-    print(f"written to {FILE.relative_to(Path.cwd()) if FILE.is_relative_to(Path.cwd()) else FILE}")
+    """Keep the figures; rows that were not measured again stay."""
+    done = {row["what"] for row in rows}
+    kept = [row for row in recorded("loop").get("rows", []) if row["what"] not in done]
+    what = "processor time of the run loop against the kernels alone; many posteriors at once"
+    command = "python benchmarks/bench_loop.py --write"
+    record("loop", what, ("jax", "numpyro", "blackjax"), {"rows": kept + rows}, command=command)
 
 
 if __name__ == "__main__":
