@@ -147,23 +147,17 @@ def extended_bic(
 
 
 def _features(seen: Look) -> Features:
-    """Of the effects' parameters, those that the fit does not hide; of a random field its standardised energy."""
+    """Of the effects' parameters, those that the fit does not hide; a random field has no feature."""
     own = np.diag(seen.scores.information)
     kept = np.flatnonzero(own > _HIDDEN * np.maximum(seen.scores.total, 1e-300))
     root = np.sqrt(own[kept])
     owner = np.concatenate(
-        [np.full(len(g), k) for k, g in enumerate(seen.scores.groups)] or [np.zeros(0, int)]
+        [np.zeros(0, int), *(np.full(len(g), k) for k, g in enumerate(seen.scores.groups))]
     )
     sided = np.array([is_one_sided(e) for e in seen.scores.effects], bool)
-    energy = seen.energy[:, :, 0]
-    mean, deviation = energy[:, 1:].mean(axis=1), energy[:, 1:].std(axis=1)
-    alive = np.flatnonzero(deviation > 0)
-    z = ((energy[alive] - mean[alive, None]) / deviation[alive, None]).T
-    correlation = np.eye(len(kept) + len(alive))
-    correlation[: len(kept), : len(kept)] = seen.scores.information[np.ix_(kept, kept)] / np.outer(root, root)
     return Features(
-        score=np.concatenate([seen.u[:, kept] / root, z], axis=1),
-        correlation=correlation,
-        positive=np.concatenate([sided[owner[kept].astype(int)], np.ones(len(alive), bool)]),
-        owner=np.concatenate([owner[kept], len(sided) + alive]).astype(int),
+        score=seen.u[:, kept] / root,
+        correlation=seen.scores.information[np.ix_(kept, kept)] / np.outer(root, root),
+        positive=sided[owner[kept]],
+        owner=owner[kept],
     )
