@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ from dtprob.testing.contract import expect, same
 _UNITS, _ROWS, _OBSERVED = 3, 8, "y"
 _STATS = ("lp", "diverging", "energy", "tree_depth", "acceptance_rate", "step_size")
 _Z = 5.0
+_COMPILED = "/jax/core/compile/backend_compile_duration"  # JAX's name of the event
 
 
 class _Case(NamedTuple):
@@ -40,10 +42,10 @@ def check_engine(engine: AbstractEngine, *, key: jax.Array | None = None) -> Non
     """Check that an engine keeps the contract, on a conjugate model.
 
     Draws are laid out (chain, draw, *event) with deterministic sites among them; the same key gives the
-    same draws and another key others; statistics and pointwise log likelihoods are there; `sample`, `save`
-    and `load` work; a key that is not a typed JAX key and data that the model does not take are refused;
-    and the posterior is that of the closed form within the Monte-Carlo error (five standard errors; engines
-    with a single value: the mode).
+    same draws and another key others; other data of the same shapes compile nothing; statistics and
+    pointwise log likelihoods are there; `sample`, `save` and `load` work; a key that is not a typed JAX key
+    and data that the model does not take are refused; and the posterior is that of the closed form within
+    the Monte-Carlo error (five standard errors; engines with a single value: the mode).
 
     Args:
         engine: the engine.
@@ -58,6 +60,7 @@ def check_engine(engine: AbstractEngine, *, key: jax.Array | None = None) -> Non
     posterior = engine(key, case.model, case.data)
     _check_layout(what, posterior, case)
     _check_keys(what, engine, case, posterior, key)
+    _check_compiled(what, engine, case, key)
     _check_sampler(what, posterior, key)
     _check_file(what, posterior)
     _check_refusals(what, engine, case, key)
@@ -163,6 +166,32 @@ def _check_keys(what: str, engine: AbstractEngine, case: _Case, posterior: Poste
         other = engine(jax.random.fold_in(key, 1), case.model, case.data)
         differs = not same(posterior.draws[case.site], other.draws[case.site])
         expect(differs, what, "other draws for another key", "the same", "Take all randomness from the key")
+
+
+def _check_compiled(what: str, engine: AbstractEngine, case: _Case, key: jax.Array) -> None:
+    """Whether the programs of earlier calls serve data of the same shapes: the same rows in another order."""
+    turned = np.roll(case.data[_OBSERVED], 1, axis=0)
+    with _compilations() as compiled:
+        engine(key, case.model, {**case.data, _OBSERVED: turned})
+    remedy = "Pass data as arguments to compiled functions, as Target.compiled does"
+    expect(not compiled, what, "nothing to compile for other data of known shapes", len(compiled), remedy)
+
+
+@contextlib.contextmanager
+def _compilations() -> Generator[list[float]]:
+    """The seconds of each compilation meanwhile."""
+    found: list[float] = []
+
+    def listen(event: str, duration_secs: float, **kwargs: str | int) -> None:
+        del kwargs
+        if event == _COMPILED:
+            found.append(duration_secs)
+
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        yield found
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
 
 
 def _check_sampler(what: str, posterior: Posterior, key: jax.Array) -> None:

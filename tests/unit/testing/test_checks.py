@@ -72,15 +72,18 @@ def test_broken_models(broken, message):
 
 @dataclasses.dataclass(frozen=True)
 class Shifted(AbstractEngine):
-    """An engine that is wrong by a little, or lays its draws out wrongly."""
+    """An engine that is wrong by a little, forgets its key, or compiles for every data set."""
 
     name: ClassVar[str] = "shifted"
     answer: ClassVar[str] = "approximation"
 
     shift: float = 0.0
     ignore_key: bool = False
+    compile_again: bool = False
 
     def __call__(self, key, model, data, **options):
+        if self.compile_again:
+            jax.jit(lambda: 2 * data["y"])()
         used = jax.random.key(0) if self.ignore_key and isinstance(key, jax.Array) else key
         posterior = Laplace(draws=2000)(used, model, data, **options)
         draws = {
@@ -96,6 +99,8 @@ def test_engines():
         check_engine(Shifted(shift=0.2))
     with pytest.raises(ContractError, match="other draws for another key"):
         check_engine(Shifted(ignore_key=True))
+    with pytest.raises(ContractError, match="nothing to compile for other data of known shapes"):
+        check_engine(Shifted(compile_again=True))
 
 
 def offset(**changes):
