@@ -14,7 +14,7 @@ from dtprob.gap.problem import Problem
 _SMOOTH_FROM: Final = 6
 _ORDER: Final = 4
 """Half waves of what counts as smooth."""
-_FINEST: Final = 128
+_FINEST: Final = 512
 """Half waves of the finest ripple that is looked for."""
 _CROSSED: Final = 3
 """Half waves along each of two columns of what varies over both."""
@@ -28,17 +28,13 @@ def curves(problem: Problem, axis: str, size: int) -> Curves:
     if size < _SMOOTH_FROM:
         return {}
     place = (np.arange(size) + 0.5) / size
-    found = {f"smooth in {axis}": _waves(place, 1, _ORDER)}
-    low = _ORDER + 1
-    while low < min(size, _FINEST):
-        high = min(2 * (low - 1), size - 1)
-        found[f"ripple in {axis}, {low} to {high} half waves"] = _waves(place, low, high)
-        low = high + 1
+    found = {f"smooth in {axis}": _waves(place, 1, _ORDER), **_ripples(axis, place)}
     columns = _columns(problem, axis, size)
     for name, column in columns.items():
         groups, index = np.unique(column, return_inverse=True)
         if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
             found[f"along {name}"] = _waves(_rank(column), 1, _ORDER)
+            found |= _ripples(name, (column - column.min()) / np.ptp(column))
         else:
             found[f"by {name}"] = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
     smooth = [name for name, column in columns.items() if np.issubdtype(column.dtype, np.floating)]
@@ -46,6 +42,16 @@ def curves(problem: Problem, axis: str, size: int) -> Curves:
         crossed = _waves(_rank(columns[one]), 1, _CROSSED), _waves(_rank(columns[other]), 1, _CROSSED)
         products = crossed[0].toarray()[:, None] * crossed[1].toarray()[None]
         found[f"over {one} and {other}"] = sparse.csr_matrix(products.reshape(-1, size))
+    return found
+
+
+def _ripples(name: str, place: np.ndarray) -> Curves:
+    """Octaves of ripples over places (size,) in (0, 1), by family name."""
+    found, low, finest = {}, _ORDER + 1, min(len(place) - 1, _FINEST)
+    while low <= finest:
+        high = min(2 * (low - 1), finest)
+        found[f"ripple in {name}, {low} to {high} half waves"] = _waves(place, low, high)
+        low = high + 1
     return found
 
 

@@ -48,7 +48,14 @@ class Trials:
 NOTHING: Final[Mapping[str, Start]] = MappingProxyType({})
 
 
-def tried(seen: View, settings: Settings, say: Say, known: Mapping[str, Start] = NOTHING) -> Trials:
+def tried(
+    seen: View,
+    settings: Settings,
+    say: Say,
+    known: Mapping[str, Start] = NOTHING,
+    *,
+    banned: str | None = None,
+) -> Trials:
     """Refits of the most promising candidates beside the effects of a view.
 
     Args:
@@ -56,6 +63,7 @@ def tried(seen: View, settings: Settings, say: Say, known: Mapping[str, Start] =
         settings: number of refits.
         say: receives one line for each.
         known: candidates to refit in any case, by name, with where to start.
+        banned: a candidate that is not to be tried.
     """
     screening, fitted = seen.screening, seen.fitted
     found: dict[str, Found] = {}
@@ -63,7 +71,7 @@ def tried(seen: View, settings: Settings, say: Say, known: Mapping[str, Start] =
         say("scanning the effects' plausible sizes")
         found = scan(seen.problem, seen.fitted.x, screening.names)
     scanned = np.array([found[n].gain if n in found else -np.inf for n in screening.names])
-    chosen = [name for name in _chosen(seen, scanned, settings) if name not in known]
+    chosen = [n for n in _chosen(seen, scanned, settings, banned) if n not in known]
     problem = seen.problem.with_live([*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
     effects = {e.name: e for e in problem.effects}
@@ -107,13 +115,13 @@ def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Fo
     return x
 
 
-def _chosen(seen: View, scanned: np.ndarray, settings: Settings) -> list[str]:
+def _chosen(seen: View, scanned: np.ndarray, settings: Settings, banned: str | None) -> list[str]:
     """The best candidates by score and, in equal number, by the scan."""
     screening = seen.screening
     able = [
         i
         for i, name in enumerate(screening.names)
-        if screening.absorbed_by[i] is None and _affordable(seen.problem, name)
+        if screening.absorbed_by[i] is None and name != banned and _affordable(seen.problem, name)
     ]
     by_score = sorted(
         (i for i in able if screening.log_bayes_factor[i] > 0), key=lambda i: -screening.log_bayes_factor[i]

@@ -79,7 +79,7 @@ def test_a_neighbour_leaks_into_an_entry(problem):
 
 def test_curves_are_smooth_ripples_columns_and_groups(problem):
     found = curves(problem, "row", LENGTH)
-    ripples = [name for name in found if name.startswith("ripple")]
+    ripples = [name for name in found if name.startswith("ripple in row")]
     waves = np.concatenate([found["smooth in row"].toarray(), *(found[n].toarray() for n in ripples)])
     np.testing.assert_allclose(waves @ waves.T, LENGTH / 2 * np.eye(LENGTH - 1), atol=1e-9)
     assert found["by street"].shape == (5, LENGTH)
