@@ -19,7 +19,7 @@ def test_sizes(box):
 
 def test_names_are_static_and_arrays_are_leaves(box):
     leaves, structure = jax.tree.flatten(box)
-    assert len(leaves) == len(DIMENSIONS) - 1  # no scattering here
+    assert len(leaves) == len(DIMENSIONS) - 2  # neither scattering nor other traces here
     assert jax.tree.unflatten(structure, leaves).object_names == box.object_names
 
 
