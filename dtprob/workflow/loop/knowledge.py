@@ -74,6 +74,11 @@ class Watched(NamedTuple):
     blame: dict[str, float]
 
 
+_CHANGED: Final = 0.5
+"""Concentration of a law that may have taken the place of the learned one (Jeffreys): a sparse prior would ask for windows
+in which only one thing ever happens."""
+
+
 def watch(case: TwinCase, state: State) -> Watched:
     """Judge the windows since the policy was handed over, by the exact evidence of new tables against those learned."""
     width = case.loop.window
