@@ -8,7 +8,7 @@ import numpy as np
 
 from dtprob.effects import catalogue
 from dtprob.gap.diagnose import diagnose
-from dtprob.gap.search import Say
+from dtprob.gap.trials import Say
 from dtprob.inference import Exact, Laplace
 from dtprob.models.declaration import declare
 from dtprob.models.multi_access import multi_access, records
