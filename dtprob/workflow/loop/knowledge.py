@@ -6,6 +6,7 @@ from typing import Any, Final, NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Float
+from scipy import special
 
 from dtprob.data import NetworkLog
 from dtprob.inference.exact import DirichletTables
@@ -21,6 +22,8 @@ RECEPTION: Final = "log_reception"
 _LIKELY: Final = 0.05
 """A factor is forgotten whose probability to have changed is at least this."""
 _DRAWS: Final = 400
+_LONGEST: Final = 128
+"""Windows that a change may have lasted before it is noticed."""
 
 
 def log_of(rows: Rows, first: int = 0, last: int | None = None) -> NetworkLog:
@@ -74,32 +77,50 @@ class Watched(NamedTuple):
     blame: dict[str, float]
 
 
-_CHANGED: Final = 0.5
-"""Concentration of a law that may have taken the place of the learned one (Jeffreys): a sparse prior would ask for windows
-in which only one thing ever happens."""
-
-
 def watch(case: TwinCase, state: State) -> Watched:
-    """Judge the windows since the policy was handed over, by the exact evidence of new tables against those learned."""
+    """Judge the windows since the policy was handed over, by the exact evidence of new tables against those learned.
+
+    A Shiryaev-Roberts detector with one new law for all windows since each possible time of a change: what they have in
+    common counts, so that a small change that lasts is found too.
+    """
     width = case.loop.window
     count = (state.slots - state.handed) // width
     every = factors(row_counts(case, state.rows))
     learned = factors(known(case, state, state.handed).concentration)
     fresh = factors(priors(case.kernel.clusters, case.concentration, memory=case.memory))
-    evidence: dict[str, np.ndarray] = {}
+    evidence: dict[str, Float[np.ndarray, "window lag"]] = {}
     for name, rows in every.items():
         own = rows[state.handed : state.handed + count * width]
         windows = own.reshape(count, width, *own.shape[1:]).sum(axis=1)
-        gain = log_marginal(fresh[name], windows) - log_marginal(learned[name], windows)
-        evidence[name] = gain.reshape(count, -1).sum(axis=1)
+        evidence[name] = _evidence_since(fresh[name], learned[name], windows)
     mixed = statistics.mixed(evidence)
-    path = statistics.detector(mixed)
+    path = np.asarray(special.logsumexp(mixed, axis=1)) if count else np.zeros(0)
     crossed = np.flatnonzero(path >= np.log(case.loop.run_length))
     alarm = int(crossed[0]) if crossed.size else None
-    until = count if alarm is None else alarm + 1
-    tail = np.cumsum(mixed[:until][::-1])[::-1]
-    changed = state.handed + width * int(np.argmax(tail))
-    return Watched(path, alarm, changed, statistics.blame({n: e[:until] for n, e in evidence.items()}))
+    last = (count if alarm is None else alarm + 1) - 1
+    lag = int(np.argmax(mixed[last])) if count else 0
+    blame = (
+        {name: np.asarray(special.logsumexp(each[last])) for name, each in evidence.items()} if count else {}
+    )
+    shares = special.softmax(np.array(list(blame.values())))
+    return Watched(
+        path, alarm, state.handed + width * (last - lag), dict(zip(blame, map(float, shares), strict=True))
+    )
+
+
+def _evidence_since(
+    fresh: Float[np.ndarray, "*row outcome"],
+    learned: Float[np.ndarray, "*row outcome"],
+    windows: Float[np.ndarray, "window *row outcome"],
+) -> Float[np.ndarray, "window lag"]:
+    """Log Bayes factors of a new law against the learned one for all of a window and the `lag` windows before it."""
+    total = np.concatenate([np.zeros_like(windows[:1]), np.cumsum(windows, axis=0)])
+    found = np.full((len(windows), min(_LONGEST, len(windows))), -np.inf)
+    for end in range(len(windows)):
+        counts = total[end + 1] - total[max(0, end + 1 - _LONGEST) : end + 1][::-1]
+        gain = log_marginal(fresh, counts) - log_marginal(learned, counts)
+        found[end, : len(counts)] = gain.reshape(len(counts), -1).sum(axis=1)
+    return found
 
 
 def forget(case: TwinCase, state: State, blame: Mapping[str, float]) -> tuple[Tables, tuple[str, ...]]:
