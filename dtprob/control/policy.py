@@ -200,7 +200,9 @@ def log_chance(logit: Float[Array, "..."], action: Int[Array, "..."]) -> Float[A
 
 def act(key: PRNGKeyArray, logit: Float[Array, "..."]) -> Int[Array, "..."]:
     """Draw actions."""
-    uniform = jax.random.uniform(key, (logit.size,)).reshape(logit.shape)  # one long row is drawn 6 times as fast
+    uniform = jax.random.uniform(key, (logit.size,)).reshape(
+        logit.shape
+    )  # one long row is drawn 6 times as fast
     return (uniform < jax.nn.sigmoid(logit)).astype(jnp.int32)
 
 

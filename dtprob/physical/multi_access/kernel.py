@@ -104,7 +104,9 @@ class PhysicalKernel:
         sends = action.astype(state.buffer.dtype) * (state.buffer > 0)
         deliveries = _inverse(parameters["log_reception"][jnp.sum(sends)], uniform[0])
         ack = _choose(sends, deliveries, uniform[1 : devices + 1])
-        arrival = self._arrivals(parameters["log_arrival"], state.arrival, uniform[devices + 1 : devices + 1 + clusters])
+        arrival = self._arrivals(
+            parameters["log_arrival"], state.arrival, uniform[devices + 1 : devices + 1 + clusters]
+        )
         overflow = (state.buffer == self.capacity) * arrival * (1 - ack)
         buffer = jnp.clip(state.buffer + arrival - ack, 0, self.capacity)
         slot = Slot(ack, overflow, jnp.sum(sends) > deliveries, self._reward(ack, overflow))
