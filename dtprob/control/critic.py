@@ -1,7 +1,7 @@
 """Critics: a central one that sees all devices, at a cost linear in their number, and a local one."""
 
 import itertools
-from typing import final
+from typing import cast, final
 
 import equinox as eqx
 import jax
@@ -79,7 +79,7 @@ class CentralCritic(eqx.Module):
         inputs = _inputs(self.own, self.frame, self.capacity)
         first, last = self.head.layers
         of_selected, of_others = jnp.split(first.weight, 2, axis=1)
-        selected = jax.vmap(jax.vmap(self.selected))(inputs) @ of_selected.T + first.bias
+        selected = jax.vmap(jax.vmap(self.selected))(inputs) @ of_selected.T + cast("Array", first.bias)
         sign = jnp.ones((*inputs.shape[:2], 1), inputs.dtype)
         acting = jnp.stack([jnp.concatenate([inputs, s * sign], axis=2) for s in (-1, 1)])
         other = jax.vmap(jax.vmap(jax.vmap(self.other)))(acting) @ of_others.T
@@ -87,7 +87,7 @@ class CentralCritic(eqx.Module):
         sends = action * (observation.buffer > 0)
         each = other[sends, device, place]
         hidden = jax.nn.relu(selected[device, place] + jnp.sum(each, axis=0) - each)
-        return hidden @ last.weight.T + last.bias
+        return hidden @ last.weight.T + cast("Array", last.bias)
 
 
 @final

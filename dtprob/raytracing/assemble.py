@@ -110,10 +110,6 @@ def assemble(
     """
     flat, index, normal, geometry = _exact(flat, objects, tx, rx)
     delay = geometry.length / speed_of_light
-    antenna_fields = {
-        "tx_field": antennas[0].field(geometry.departure, flat.link, len(tx)),
-        "rx_field": antennas[1].field(-geometry.arrival, flat.link, len(tx)),
-    }
     rows = _Rows(flat.link, len(tx))
     return validate(
         PathSet(
@@ -127,7 +123,8 @@ def assemble(
             vertex=rows.fill(geometry.vertex, 0.0),
             normal=rows.fill(normal, (0.0, 0.0, 1.0)),
             length=rows.fill(geometry.length, 1.0),
-            **{name: rows.fill(value, 0.0) for name, value in antenna_fields.items()},
+            tx_field=rows.fill(antennas[0].field(geometry.departure, flat.link, len(tx)), 0.0),
+            rx_field=rows.fill(antennas[1].field(-geometry.arrival, flat.link, len(tx)), 0.0),
             rx_position=jnp.asarray(rx),
             tx_position=jnp.asarray(tx),
             object_material=jnp.asarray(objects.material, jnp.int32),
