@@ -68,7 +68,8 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
         case "UNLISTED":
             sites = ", ".join(s.site for s in evidence.after.sites[:2] if s.p_value <= 0.01)
             tail = f" It shows at {sites}." if sites else ""
-            return f"There is a gap, and none of the known effects explains it.{tail}"
+            part = f" {name} imitates part of it." if name else ""
+            return f"There is a gap, and none of the known effects explains it.{tail}{part}"
         case _:
             if best is None:
                 return "There are signs of a gap, but the data cannot tell which effect causes it."

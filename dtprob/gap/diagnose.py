@@ -157,7 +157,7 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
     remains = evidence.after.site_p_value <= level
     if cause.closed_fraction is None:
         return "UNLISTED" if remains else "UNDETERMINED"
-    if remains and cause.closed_fraction.mean < settings.relevance:
+    if remains and cause.closed_fraction.mean < _relevance(evidence, settings):
         return "UNLISTED"
     if cause.probability < settings.credibility:
         return "UNDETERMINED"
@@ -166,9 +166,16 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
     )
 
 
+def _relevance(evidence: Evidence, settings: Settings) -> float:
+    """Share of the gap below which causes that leave something are no explanation; random fields imitate much."""
+    kinds = {e.kind for e in evidence.problem.effects if e.name in evidence.accepted}
+    return settings.relevance if "mean" in kinds else max(settings.relevance, settings.field_relevance)
+
+
 def _negligible(evidence: Evidence, settings: Settings) -> bool:
     """Whether the base model's held-out error is already below what the user cares about."""
-    error, tolerance = closed.error_db(evidence.problem, evidence.held_before), settings.tolerance_db
+    tolerance = settings.tolerance_db
+    error = None if tolerance is None else closed.error_db(evidence.problem, evidence.held_before)
     if tolerance is None or error is None:
         return False
     return error <= (abs(tolerance) if evidence.problem.has_powers else -abs(tolerance))

@@ -20,7 +20,8 @@ class Settings:
         grid: trial sizes per effect parameter when a refit looks for its starting points.
         starts: starting points of a refit.
         credibility: probability that a reported class of causes must hold.
-        relevance: share of the gap that causes must close to count as its explanation.
+        relevance: share of the gap that causes must close to count as its explanation where something is left.
+        field_relevance: the same of random fields alone, which can imitate nearly anything.
         minor: a further effect must add this share of the evidence that the effects before it have brought.
         tolerance_db: residual error that the user does not care about, in dB below the signal; of powers, their rms
             error in dB. None for no tolerance.
@@ -37,5 +38,6 @@ class Settings:
     starts: int = 2
     credibility: float = 0.9
     relevance: float = 0.5
+    field_relevance: float = 0.9
     minor: float = 0.03
     tolerance_db: float | None = None

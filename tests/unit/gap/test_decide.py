@@ -1,0 +1,48 @@
+"""The verdict that follows from what was accepted, what it closes and what is left."""
+
+from types import SimpleNamespace
+
+import pytest
+
+from dtprob.gap.closed import ClosedFraction
+from dtprob.gap.diagnose import decide
+from dtprob.gap.settings import Settings
+
+
+def evidence(kind, p_after):
+    """What `decide` looks at: one accepted effect of a kind, and the sites' p-value beside it."""
+    view = SimpleNamespace(alarmed=lambda settings: True)
+    return SimpleNamespace(
+        problem=SimpleNamespace(effects=[SimpleNamespace(name="a", kind=kind)]),
+        accepted=("a",),
+        steps=[SimpleNamespace(view=view)],
+        before=SimpleNamespace(site_p_value=1e-9),
+        after=SimpleNamespace(site_p_value=p_after),
+    )
+
+
+def cause(closed):
+    fraction = None if closed is None else ClosedFraction(closed, closed - 0.1, min(closed + 0.1, 1.0))
+    return SimpleNamespace(closed_fraction=fraction, probability=0.99)
+
+
+@pytest.mark.parametrize(
+    ("kind", "closed", "p_after", "verdict"),
+    [
+        ("mean", 0.99, 0.5, "LISTED"),
+        ("mean", 0.85, 1e-6, "LISTED_WITH_REMAINDER"),
+        ("mean", 0.4, 1e-6, "UNLISTED"),
+        ("mean", 0.99, 1e-6, "LISTED"),
+        ("mean", None, 1e-6, "UNLISTED"),
+        ("mean", None, 0.5, "UNDETERMINED"),
+        ("variance", 0.85, 0.5, "LISTED"),
+        ("variance", 0.95, 1e-6, "LISTED_WITH_REMAINDER"),
+        ("variance", 0.85, 1e-6, "UNLISTED"),
+    ],
+)
+def test_verdicts(kind, closed, p_after, verdict):
+    assert decide(evidence(kind, p_after), (cause(closed),), Settings()) == verdict
+
+
+def test_no_cause_is_unlisted_where_a_site_is_wrong():
+    assert decide(evidence("mean", 1e-6), (), Settings()) == "UNLISTED"
