@@ -1,6 +1,9 @@
 """Settings of the whole test suite: double precision, a sound compiler, and no silent skips on CI."""
 
+import gc
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +14,20 @@ avoid_miscompilation()  # before jax is imported
 import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
+
+
+_MAPS = Path("/proc/self/maps")
+_MOST_MAPS = 25_000
+"""Memory regions of a process after which compiled programs are let go: each takes some, and Linux allows 65,530."""
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_programs_are_let_go() -> Iterator[None]:
+    """A process that runs many modules does not keep every program that it ever compiled."""
+    yield
+    if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
+        jax.clear_caches()
+        gc.collect()
 
 
 @pytest.hookimpl(wrapper=True)
