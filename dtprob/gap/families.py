@@ -34,12 +34,10 @@ class Pattern:
     kept: tuple[int, ...]
     curves: sparse.csr_matrix | None = None
 
-    def scores(self, entries: np.ndarray) -> np.ndarray:
-        """Scores (n, weight x part) of the weights from those of the entries (n, *site, part)."""
-        gone = tuple(1 + i for i in range(entries.ndim - 2) if i not in self.kept)
-        summed = entries.sum(axis=gone)
+    def scores(self, summed: np.ndarray) -> np.ndarray:
+        """Scores (n, weight x part) of the weights from those of the entries (n, *kept, part), other axes summed over."""
         if self.curves is None:
-            return summed.reshape(len(entries), -1)
+            return summed.reshape(len(summed), -1)
         n, size, part = summed.shape
         mixed = self.curves @ np.moveaxis(summed, 1, 0).reshape(size, n * part)
         return np.moveaxis(mixed.reshape(-1, n, part), 0, 1).reshape(n, -1)
@@ -163,9 +161,12 @@ def families(problem: Problem, site: Site) -> Iterator[tuple[Family, np.ndarray]
     """Every family of a site with its scores (1 + replicate, entry), one after another."""
     patterns = list(_patterns(problem, site))
     for kind, factor in site.kinds.items():
-        entries = site.entries(kind)
+        entries, summed = site.entries(kind), dict[tuple[int, ...], np.ndarray]()
         for pattern in patterns:
-            yield Family(kind, pattern, factor), pattern.scores(entries)
+            if pattern.kept not in summed:
+                gone = tuple(1 + i for i in range(len(site.shape)) if i not in pattern.kept)
+                summed[pattern.kept] = entries.sum(axis=gone)
+            yield Family(kind, pattern, factor), pattern.scores(summed[pattern.kept])
 
 
 def _patterns(problem: Problem, site: Site) -> Iterator[Pattern]:
