@@ -28,7 +28,9 @@ EPS, SIGMA = 5.31, 0.139
 def paths(box):
     """The eight shortest paths of each link: with all 25 the tests only take longer."""
     chosen = {
-        name: getattr(box, name)[:, :8] for name, dims in DIMENSIONS.items() if dims[:2] == ("link", "path")
+        name: getattr(box, name)[:, :8]
+        for name, dims in DIMENSIONS.items()
+        if dims[:2] == ("link", "path") and getattr(box, name) is not None
     }
     return eqx.tree_at(lambda paths: [getattr(paths, name) for name in chosen], box, list(chosen.values()))
 
