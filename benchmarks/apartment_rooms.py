@@ -17,7 +17,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,8 +27,9 @@ from dtprob.case import load_case
 from dtprob.effects import catalogue, with_effects
 from dtprob.inference import Posterior, fit
 from dtprob.models.declaration import declare
+from dtprob.raytracing.beyond import strongest
 from dtprob.raytracing.field import frequency_response, path_gain, synthesize
-from dtprob.raytracing.paths import DIMENSIONS, PathSet
+from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.phasor import phasor
 from dtprob.workflow import prepare
 
@@ -90,18 +90,6 @@ def twin(cache: Path | None) -> tuple[Any, dict[str, Any]]:
     data = {**prepared.data, "paths": strongest(prepared.data["paths"], KEPT)}
     sites = declare(prepared.model, data, cluster="link").sites
     return with_effects(prepared.model, catalogue(sites, data, use=["diffuse_scattering"])), data
-
-
-def strongest(paths: PathSet, count: int) -> PathSet:
-    """The strongest paths of each link, as the scene's own materials have them."""
-    power = np.abs(np.asarray(path_gain(paths, paths.permittivity, paths.conductivity)))
-    best = np.argsort(-power, axis=1, kind="stable")[:, :count]
-    chosen = {
-        name: jnp.asarray(np.take_along_axis(a, best.reshape(*best.shape, *[1] * (a.ndim - 2)), axis=1))
-        for name, dims in DIMENSIONS.items()
-        if dims[1:2] == ("path",) and (a := np.asarray(getattr(paths, name))).ndim
-    }
-    return eqx.tree_at(lambda p: [getattr(p, name) for name in chosen], paths, list(chosen.values()))
 
 
 def rooms_of(paths: PathSet) -> np.ndarray:

@@ -26,7 +26,7 @@ def test_fit_by_name_and_by_engine():
 
 def test_names_are_those_of_the_table():
     assert set(ENGINES) == {
-        *("auto", "exact", "nuts", "blackjax_nuts", "smc", "svi"),
+        *("auto", "exact", "nuts", "blackjax_nuts", "hmc", "smc", "svi"),
         *("von_mises_em", "laplace", "ensemble", "point"),
     }
     for name in ENGINES:
