@@ -13,8 +13,10 @@ benchmarks/results/loop.json.
 """
 
 import argparse
+import os
 import time
 from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 from dtprob.xla import avoid_miscompilation
@@ -118,7 +120,9 @@ def loop(kind: type[NUTS] | type[BlackJAXNUTS], rounds: int) -> dict[str, Any]:
 
     def plain() -> np.ndarray:
         keys = [jax.random.fold_in(key, chain) for chain in range(STEPS["chains"])]
-        return np.stack([compiled(point, one, inputs) for one in keys])[:, STEPS["warmup"] :]
+        with ThreadPoolExecutor(os.cpu_count() or 1) as pool:  # as the run loop does: cores share caches
+            paths = list(pool.map(lambda one: np.asarray(compiled(point, one, inputs)), keys))
+        return np.stack(paths)[:, STEPS["warmup"] :]
 
     ours = engine(key, regression, data, options=LEAN).draws["weight"]
     theirs = inputs.location + inputs.scale * plain()
