@@ -20,7 +20,8 @@ _CROSSED: Final = 3
 """Half waves along each of two columns of what varies over both."""
 _MOST_PAIRS: Final = 6
 
-type Curves = dict[str, sparse.csr_matrix]
+type Curve = np.ndarray | sparse.csr_matrix
+type Curves = dict[str, Curve]
 
 
 def curves(problem: Problem, axis: str, size: int) -> Curves:
@@ -40,8 +41,8 @@ def curves(problem: Problem, axis: str, size: int) -> Curves:
     smooth = [name for name, column in columns.items() if np.issubdtype(column.dtype, np.floating)]
     for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
         crossed = _waves(_rank(columns[one]), 1, _CROSSED), _waves(_rank(columns[other]), 1, _CROSSED)
-        products = crossed[0].toarray()[:, None] * crossed[1].toarray()[None]
-        found[f"over {one} and {other}"] = sparse.csr_matrix(products.reshape(-1, size))
+        products = crossed[0][:, None] * crossed[1][None]
+        found[f"over {one} and {other}"] = products.reshape(-1, size)
     return found
 
 
@@ -55,9 +56,9 @@ def _ripples(name: str, place: np.ndarray) -> Curves:
     return found
 
 
-def _waves(place: np.ndarray, low: int, high: int) -> sparse.csr_matrix:
+def _waves(place: np.ndarray, low: int, high: int) -> np.ndarray:
     """Cosines of low to high half waves over places (size,) in (0, 1)."""
-    return sparse.csr_matrix(np.cos(np.pi * np.outer(np.arange(low, high + 1), place)))
+    return np.cos(np.pi * np.outer(np.arange(low, high + 1), place))
 
 
 def _rank(column: np.ndarray) -> np.ndarray:

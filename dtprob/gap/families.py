@@ -7,17 +7,17 @@ are shared along some axes, that vary smoothly or as a ripple along one, with a 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import cached_property
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import sparse
 
-from dtprob.gap.curves import curves
+from dtprob.gap.curves import Curve, Curves
 from dtprob.gap.problem import Problem
+
+type Along = Callable[[str, int], Curves]
 
 
 @dataclass(frozen=True)
@@ -32,7 +32,7 @@ class Pattern:
 
     label: str
     kept: tuple[int, ...]
-    curves: sparse.csr_matrix | None = None
+    curves: Curve | None = None
 
     def scores(self, summed: np.ndarray) -> np.ndarray:
         """Scores (n, weight x part) of the weights from those of the entries (n, *kept, part), other axes summed over."""
@@ -102,11 +102,6 @@ class Site:
         entry = self.gradients * self.kinds[kind]
         return np.stack([np.real(entry), np.imag(entry)], -1) if np.iscomplexobj(entry) else entry[..., None]
 
-    @cached_property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the site."""
-        return self.gradients.shape[1:]
-
 
 def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients: np.ndarray) -> Site:
     """A deterministic site of the model; `value` may be smaller than the gradients along axes of size 1."""
@@ -157,24 +152,29 @@ def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> j
     return jnp.stack(found)
 
 
-def families(problem: Problem, site: Site) -> Iterator[tuple[Family, np.ndarray]]:
-    """Every family of a site with its scores (1 + replicate, entry), one after another."""
-    patterns = list(_patterns(problem, site))
+def families(along: Along, site: Site) -> Iterator[tuple[Family, np.ndarray]]:
+    """Every family of a site with its scores (1 + replicate, entry), one after another.
+
+    Args:
+        along: the curves along an axis of a size.
+        site: what is perturbed.
+    """
+    patterns = list(_patterns(along, site))
     for kind, factor in site.kinds.items():
         entries, summed = site.entries(kind), dict[tuple[int, ...], np.ndarray]()
         for pattern in patterns:
             if pattern.kept not in summed:
-                gone = tuple(1 + i for i in range(len(site.shape)) if i not in pattern.kept)
+                gone = tuple(1 + i for i in range(site.value.ndim) if i not in pattern.kept)
                 summed[pattern.kept] = entries.sum(axis=gone)
             yield Family(kind, pattern, factor), pattern.scores(summed[pattern.kept])
 
 
-def _patterns(problem: Problem, site: Site) -> Iterator[Pattern]:
+def _patterns(along: Along, site: Site) -> Iterator[Pattern]:
     """Pooled along axes, and along curves on one axis."""
-    for kept in _kept_axes(site.shape):
+    for kept in _kept_axes(site.value.shape):
         yield Pattern(" x ".join(site.axes[i] for i in kept) or "common", kept)
     for i, axis in enumerate(site.axes):
-        for label, curve in curves(problem, axis, site.shape[i]).items():
+        for label, curve in along(axis, site.value.shape[i]).items():
             yield Pattern(label, (i,), curve)
 
 

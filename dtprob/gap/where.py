@@ -6,6 +6,7 @@ all families of all sites.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.bootstrap import Replicates
+from dtprob.gap.curves import curves
 from dtprob.gap.families import Family, Site, deterministic, families, observed, shifted
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
@@ -79,7 +81,8 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
     found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
     found += observed(problem, jnp.concatenate([drawn.observed[None], drawn.projected]))
-    tested = [[_family_test(*family) for family in families(problem, site)] for site in found]
+    along = functools.cache(functools.partial(curves, problem))  # sites share their axes
+    tested = [[_family_test(*family) for family in families(along, site)] for site in found]
     null = [test.null for tests in tested for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
     findings = [
