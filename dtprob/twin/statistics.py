@@ -102,10 +102,13 @@ def mixed(evidence: Mapping[str, Float[np.ndarray, " window"]]) -> Float[np.ndar
 
 def blame(evidence: Mapping[str, Float[np.ndarray, " window"]]) -> dict[str, float]:
     """Probability of each factor to be the one that changed, by each one's own detector in the last window."""
-    paths = {name: float(detector(each)[-1]) for name, each in evidence.items()}
-    top = max(paths.values())
-    weight = {name: float(np.exp(value - top)) for name, value in paths.items()}
-    return {name: value / sum(weight.values()) for name, value in weight.items()}
+    return shares({name: float(detector(each)[-1]) for name, each in evidence.items()})
+
+
+def shares(evidence: Mapping[str, float]) -> dict[str, float]:
+    """Probabilities of alternatives that were alike before, from the log evidence of each."""
+    weight = special.softmax(np.array(list(evidence.values())))
+    return dict(zip(evidence, map(float, weight), strict=True))
 
 
 def roc(

@@ -94,18 +94,13 @@ def watch(case: TwinCase, state: State) -> Watched:
         windows = own.reshape(count, width, *own.shape[1:]).sum(axis=1)
         evidence[name] = _evidence_since(fresh[name], learned[name], windows)
     mixed = statistics.mixed(evidence)
-    path = np.asarray(special.logsumexp(mixed, axis=1)) if count else np.zeros(0)
+    path = np.asarray(special.logsumexp(mixed, axis=1))
     crossed = np.flatnonzero(path >= np.log(case.loop.run_length))
     alarm = int(crossed[0]) if crossed.size else None
-    last = (count if alarm is None else alarm + 1) - 1
-    lag = int(np.argmax(mixed[last])) if count else 0
-    blame = (
-        {name: np.asarray(special.logsumexp(each[last])) for name, each in evidence.items()} if count else {}
-    )
-    shares = special.softmax(np.array(list(blame.values())))
-    return Watched(
-        path, alarm, state.handed + width * (last - lag), dict(zip(blame, map(float, shares), strict=True))
-    )
+    last = count - 1 if alarm is None else alarm
+    changed = state.handed + width * (last - int(np.argmax(mixed[last])))
+    blame = statistics.shares({n: float(np.asarray(special.logsumexp(e[last]))) for n, e in evidence.items()})
+    return Watched(path, alarm, changed, blame)
 
 
 def _evidence_since(
