@@ -92,7 +92,7 @@ def watch(case: TwinCase, state: State) -> Watched:
     for name, rows in every.items():
         own = rows[state.handed : state.handed + count * width]
         windows = own.reshape(count, width, *own.shape[1:]).sum(axis=1)
-        evidence[name] = _evidence_since(fresh[name], learned[name], windows)
+        evidence[name] = evidence_since(fresh[name], learned[name], windows)
     mixed = statistics.mixed(evidence)
     path = np.asarray(special.logsumexp(mixed, axis=1))
     crossed = np.flatnonzero(path >= np.log(case.loop.run_length))
@@ -103,7 +103,7 @@ def watch(case: TwinCase, state: State) -> Watched:
     return Watched(path, alarm, changed, blame)
 
 
-def _evidence_since(
+def evidence_since(
     fresh: Float[np.ndarray, "*row outcome"],
     learned: Float[np.ndarray, "*row outcome"],
     windows: Float[np.ndarray, "window *row outcome"],
