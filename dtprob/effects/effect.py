@@ -28,6 +28,7 @@ type Model = Callable[..., Any]
 type EffectKind = Literal["mean", "variance"]
 
 FIELD = "field"
+_ADDED = "__dtprob_effects__"
 
 
 @dataclass(frozen=True)
@@ -282,4 +283,12 @@ def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
             return model(**data)
 
     extended.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
+    setattr(extended, _ADDED, (*effects_of(model), *effects))
     return extended
+
+
+def effects_of(model: Model) -> tuple[Effect, ...]:
+    """The effects that `with_effects` has extended a model by, the first added first."""
+    while isinstance(model, functools.partial):
+        model = model.func
+    return getattr(model, _ADDED, ())

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Collection
+
 import jax
 import numpy as np
 
+from dtprob.effects.effect import effects_of
 from dtprob.errors import InputError
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
@@ -26,6 +29,9 @@ _COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
 def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 3) -> fitting.Fit:
     """Posterior mode of the model without effects, the best of several starts.
 
+    Effects that the model was extended by start at the centre of their prior, and other peaks along their parameters are
+    looked for in any case: a displacement of half a wavelength is a local optimum.
+
     Args:
         problem: the model on its data.
         key: for prior draws.
@@ -36,6 +42,9 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         InputError: the model has no finite likelihood from any start.
     """
     draws = problem.prior_draws(key, _PRIOR_DRAWS)
+    added = [e.site_name(p.name) for e in effects_of(problem.model) for p in e.parameters]
+    for block in (problem.layout[name] for name in added):
+        draws[:, block.index] = np.median(draws[:, block.index], axis=0)
     fits = []
     for x in [np.median(draws, axis=0), *draws[: starts - 1]]:
         fitted = fitting.fit(problem, _sweep_angles(problem, x))
@@ -53,7 +62,8 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         )
     found = _apart(fits)
     freed = [polish(problem, fitted) for fitted in found[:polished]]
-    return max([*freed, *found[polished:]], key=lambda f: f.log_posterior)
+    best = max([*freed, *found[polished:]], key=lambda f: f.log_posterior)
+    return polish(problem, best, added) if added and not polished else best
 
 
 def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:
@@ -65,16 +75,17 @@ def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:
     return kept
 
 
-def polish(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
+def polish(problem: Problem, fitted: fitting.Fit, along: Collection[str] | None = None) -> fitting.Fit:
     """Leave local optima: refit from the other peaks along each global nuisance until none is better.
 
     Args:
         problem: the model on its data.
         fitted: a mode.
+        along: names of the nuisances to look along; all by default.
     """
     scale = problem.prior_draws(jax.random.key(0), _PRIOR_DRAWS).std(axis=0)
     for _ in range(_ROUNDS):
-        peaks = _other_peaks(problem, fitted.x, scale)
+        peaks = _other_peaks(problem, fitted.x, scale, along)
         short = [fitting.fit(problem, x, fitted.effects, spread=fitted.spread, steps=_SHORT) for x in peaks]
         short.sort(key=lambda f: -f.log_posterior)
         long = [fitting.fit(problem, f.x, fitted.effects, spread=fitted.spread) for f in short[:_LONG]]
@@ -85,7 +96,9 @@ def polish(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
     return fitted
 
 
-def _other_peaks(problem: Problem, x: np.ndarray, scale: np.ndarray) -> list[np.ndarray]:
+def _other_peaks(
+    problem: Problem, x: np.ndarray, scale: np.ndarray, along: Collection[str] | None
+) -> list[np.ndarray]:
     """The highest other peaks of the log posterior along each global nuisance, its companions moved along.
 
     Companions are the entries at the same place of nuisances in the same plates, as a material's conductivity is of its
@@ -94,7 +107,7 @@ def _other_peaks(problem: Problem, x: np.ndarray, scale: np.ndarray) -> list[np.
     found: list[tuple[float, np.ndarray]] = []
     offsets = np.linspace(-_REACH, _REACH, _GRID)
     blocks = [b for b in problem.blocks_of(None) if not b.local]
-    for block in blocks:
+    for block in (b for b in blocks if along is None or b.name in along):
         plates = problem.declaration.sites[block.name].plates
         others = [
             b
