@@ -12,7 +12,7 @@ import numpy as np
 
 from dtprob.gap import whiten
 from dtprob.gap.quick import quick_jit
-from dtprob.gap.running import Runner
+from dtprob.gap.running import Outcome, Runner
 
 _CHUNK = 16
 _DECIBELS = 10.0 / np.log(10.0)
@@ -37,12 +37,11 @@ class Compiled:
 
         @jax.jit
         def evaluate(x: Any, arrays: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-            trace, prior, local = self._runner.run(x, arrays, {})
-            rows = {}
-            for name, observed in self._runner.observations(trace).items():
-                density = whiten.log_prob(observed, trace[name]["value"])
+            found, rows = self._runner.run(x, arrays, {}), {}
+            for name, observed in self._runner.around(found.parameters).items():
+                density = whiten.log_prob(observed, found.values[name])
                 rows[name] = jnp.zeros(self._runner.shapes[name]).at[0].set(density)
-            return self._runner.rows.stack(rows).sum(1), prior, local
+            return self._runner.rows.stack(rows).sum(1), found.prior, found.local
 
         return lambda x: evaluate(jnp.asarray(x), self._arrays)
 
@@ -53,10 +52,8 @@ class Compiled:
         @jax.jit
         def profile(xs: jax.Array, arrays: Any) -> jax.Array:
             def one(x: jax.Array) -> jax.Array:
-                trace, prior, local = self._runner.run(x, arrays, {})
-                observed = self._runner.observations(trace).items()
-                density = [jnp.sum(whiten.log_prob(o, trace[n]["value"])) for n, o in observed]
-                return jnp.sum(jnp.stack(density)) + prior + jnp.sum(local)
+                found = self._runner.run(x, arrays, {})
+                return self._likelihood(found) + found.prior + jnp.sum(found.local)
 
             return jax.lax.map(one, xs)
 
@@ -81,11 +78,8 @@ class Compiled:
         @jax.jit
         def linearised(x: Any, basis: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
             def parameters(x: Any) -> tuple[dict[str, whiten.Parameters], dict[str, jax.Array]]:
-                trace, _, _ = self._runner.run(x, arrays, {})
-                observed = self._runner.observations(trace)
-                return {n: o.parameters for n, o in observed.items()}, {
-                    n: trace[n]["value"] for n in observed
-                }
+                found = self._runner.run(x, arrays, {})
+                return found.parameters, found.values
 
             here, push, values = jax.linearize(parameters, x, has_aux=True)
             observations = self._runner.around(here)
@@ -112,8 +106,7 @@ class Compiled:
 
         @quick_jit
         def replicate(x: Any, keys: jax.Array, arrays: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
-            trace, _, _ = self._runner.run(x, arrays, {})
-            observations = self._runner.observations(trace)
+            observations = self._runner.around(self._runner.run(x, arrays, {}).parameters)
 
             def one(key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
                 split = zip(observations.items(), jax.random.split(key, len(observations)), strict=True)
@@ -135,8 +128,7 @@ class Compiled:
             zero = {name: jnp.zeros(s.shape, s.dtype) for name, s in self._float_sites.items()}
 
             def parameters(deltas: Mapping[str, Any]) -> dict[str, whiten.Parameters]:
-                trace, _, _ = self._runner.run(x, arrays, deltas)
-                return {name: o.parameters for name, o in self._runner.observations(trace).items()}
+                return self._runner.run(x, arrays, deltas).parameters
 
             here, push = jax.linearize(parameters, zero)
             observations = self._runner.around(here)
@@ -159,8 +151,7 @@ class Compiled:
             zero = {name: jnp.zeros(s.shape, s.dtype) for name, s in self._float_sites.items()}
 
             def parameters(moved: dict[str, jax.Array]) -> dict[str, whiten.Parameters]:
-                trace, _, _ = self._runner.run(x, arrays, moved)
-                return {name: o.parameters for name, o in self._runner.observations(trace).items()}
+                return self._runner.run(x, arrays, moved).parameters
 
             here, push = jax.linearize(parameters, zero)
             observations = self._runner.around(here)
@@ -187,11 +178,7 @@ class Compiled:
         @quick_jit
         def shifted_likelihood(x: Any, deltas: dict[str, jax.Array], arrays: Any) -> jax.Array:
             def one(delta: dict[str, jax.Array]) -> jax.Array:
-                trace, _, _ = self._runner.run(x, arrays, delta)
-                observed = self._runner.observations(trace).items()
-                return jnp.sum(
-                    jnp.stack([jnp.sum(whiten.log_prob(o, trace[n]["value"])) for n, o in observed])
-                )
+                return self._likelihood(self._runner.run(x, arrays, delta))
 
             return jax.lax.map(one, deltas)
 
@@ -203,33 +190,37 @@ class Compiled:
 
         return chunked
 
+    def _likelihood(self, found: Outcome) -> jax.Array:
+        """Log likelihood of all data."""
+        observed = self._runner.around(found.parameters).items()
+        return jnp.sum(jnp.stack([jnp.sum(whiten.log_prob(o, found.values[n])) for n, o in observed]))
+
     def _padded(self, deltas: Mapping[str, Any], n: int) -> Iterator[dict[str, jax.Array]]:
         """Perturbations of all sites in chunks of one size, zero where none is given."""
         for start in range(0, n, _CHUNK):
-            chunk = {}
-            for name, s in self._float_sites.items():
-                part = np.zeros((_CHUNK, *s.shape), s.dtype)
-                if name in deltas:
-                    given = np.asarray(deltas[name])[start : start + _CHUNK]
-                    part[: len(given)] = given
-                chunk[name] = jnp.asarray(part)
+            chunk = dict(self._nowhere)
+            for name, given in deltas.items():
+                chunk[name] = _filled(np.asarray(given[start : start + _CHUNK]), self._nowhere[name])
             yield chunk
+
+    @cached_property
+    def _nowhere(self) -> dict[str, jax.Array]:
+        """One chunk of perturbations that perturb nothing."""
+        return {n: jnp.zeros((_CHUNK, *s.shape), s.dtype) for n, s in self._float_sites.items()}
 
     @cached_property
     def _state(self) -> Callable[[np.ndarray], _State]:
         @quick_jit
         def state(x: Any, arrays: Any) -> _State:
-            trace, _, _ = self._runner.run(x, arrays, {})
-            observed = self._runner.observations(trace)
+            found = self._runner.run(x, arrays, {})
             error, signal = {}, {}
-            for name, o in observed.items():
+            for name, o in self._runner.around(found.parameters).items():
                 zero = jnp.zeros(self._runner.shapes[name])
-                squared, power = _squared_error(o, trace[name]["value"])
+                squared, power = _squared_error(o, found.values[name])
                 error[name], signal[name] = zero.at[0].set(squared), zero.at[0].set(power)
-            names = [*self._runner.declaration.latent, *self._runner.declaration.deterministic]
             return _State(
-                {n: trace[n]["value"] for n in names},
-                {n: o.parameters for n, o in observed.items()},
+                found.sites,
+                found.parameters,
                 self._runner.rows.stack(error).sum(1),
                 self._runner.rows.stack(signal).sum(1),
             )
@@ -275,6 +266,13 @@ class _State(NamedTuple):
     observed: dict[str, whiten.Parameters]
     error: jax.Array
     signal: jax.Array
+
+
+def _filled(given: np.ndarray, like: jax.Array) -> jax.Array:
+    """Perturbations of one site (n, ...) as one whole chunk."""
+    part = np.zeros(like.shape, like.dtype)
+    part[: len(given)] = given
+    return jnp.asarray(part)
 
 
 def _chunks(basis: np.ndarray) -> Iterator[jax.Array]:

@@ -183,10 +183,10 @@ class Problem:
             data = eqx.combine(arrays, self._static)
             grown: dict[str, Any] = {}
             for _ in range(2):  # a site may grow because one before it has
-                trace, _, _ = self._runner.run(jnp.zeros(self.dimension), arrays, grown)
-                values = {n: jnp.asarray(trace[n]["value"]) for n in self.declaration.deterministic}
+                found = self._runner.run(jnp.zeros(self.dimension), arrays, grown)
+                values = {n: found.sites[n] for n in self.declaration.deterministic}
                 grown = {n: jnp.zeros(v.shape, v.dtype) for n, v in values.items()}
-                context = Context(data, {n: m["value"] for n, m in trace.items()})
+                context = Context(data, found.everything)
                 for effect in self.effects:
                     parameters = effect.null()
                     if effect.kind == "variance":

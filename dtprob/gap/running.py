@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, final
+from functools import cached_property
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -30,6 +31,29 @@ class _Shift(Messenger):
     def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         if msg["type"] == "deterministic" and msg["name"] in self._deltas:
             msg["value"] = msg["value"] + self._deltas[msg["name"]]
+
+
+class Outcome(NamedTuple):
+    """What a model says at a point.
+
+    Attributes:
+        sites: values of the latent and deterministic sites.
+        values: of the observed ones, the data.
+        parameters: of the observed distributions.
+        prior: log prior of the global base latents.
+        local: log prior of the local ones, per cluster.
+    """
+
+    sites: dict[str, jax.Array]
+    values: dict[str, jax.Array]
+    parameters: dict[str, whiten.Parameters]
+    prior: jax.Array
+    local: jax.Array
+
+    @property
+    def everything(self) -> dict[str, jax.Array]:
+        """Values of all sites."""
+        return {**self.sites, **self.values}
 
 
 @final
@@ -59,10 +83,12 @@ class Runner:
     families: Mapping[str, str]
     known: Mapping[str, tuple[np.ndarray, np.ndarray]]
 
-    def run(
-        self, x: Any, arrays: Any, deltas: Mapping[str, Any]
-    ) -> tuple[dict[str, Any], jax.Array, jax.Array]:
-        """Trace at x with perturbed sites; also the log prior of the base latents, global and per cluster."""
+    @cached_property
+    def run(self) -> Callable[[Any, Any, Mapping[str, Any]], Outcome]:
+        """(x, arrays, perturbations of sites) -> what the model says there; all that calls it shares one trace."""
+        return jax.jit(self._run)
+
+    def _run(self, x: Any, arrays: Any, deltas: Mapping[str, Any]) -> Outcome:
         data = eqx.combine(arrays, self.static)
         latent = {name: self.layout.part(x, name) for name in self.declaration.latent}
         jacobians: dict[str, Any] = {}
@@ -95,7 +121,15 @@ class Runner:
                 local = local + jnp.moveaxis(density, axis, 0).reshape(self.rows.n_cluster, -1).sum(1)
             else:
                 total = total + jnp.sum(density)
-        return trace, total, local
+        names = [*self.declaration.latent, *self.declaration.deterministic]
+        observed = observations(self.declaration, trace)
+        return Outcome(
+            {n: jnp.asarray(trace[n]["value"]) for n in names},
+            {n: jnp.asarray(trace[n]["value"]) for n in observed},
+            {n: o.parameters for n, o in observed.items()},
+            total,
+            local,
+        )
 
     def _parameters(self, x: Any) -> dict[str, dict[str, Any]]:
         parameters: dict[str, dict[str, Any]] = {}
@@ -116,18 +150,14 @@ class Runner:
             total = total - 0.5 * d @ (precision @ d)
         return total
 
-    def observations(self, trace: Mapping[str, Any]) -> dict[str, whiten.Observation]:
-        """The elementwise distributions of the observed sites of a trace."""
-        return observations(self.declaration, trace)
-
     def around(self, parameters: Mapping[str, whiten.Parameters]) -> dict[str, whiten.Observation]:
         """The observed distributions with given parameters."""
         return {n: whiten.Observation(f, dict(parameters[n])) for n, f in self.families.items()}
 
     def log_prior(self, x: Any, arrays: Any) -> jax.Array:
         """Log prior of the base latents."""
-        _, prior, local = self.run(x, arrays, {})
-        return prior + jnp.sum(local)
+        found = self.run(x, arrays, {})
+        return found.prior + jnp.sum(found.local)
 
 
 def observations(declaration: Declaration, trace: Mapping[str, Any]) -> dict[str, whiten.Observation]:
