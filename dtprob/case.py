@@ -59,7 +59,8 @@ class SceneSection:
             plan (.json, also "data set/floorplan.json" of a measured set).
         frequency: carrier, Hz; a path set knows its own.
         max_depth: most interactions on a path.
-        refraction, diffraction, diffuse_reflection: what the twin traces besides specular reflection.
+        refraction, diffraction, diffuse_reflection: what the twin traces besides specular reflection; the last two
+            are refused, since dtprob cannot trace them yet.
         tx_pattern, rx_pattern, polarization: of the antenna elements, as sionna-rt names them.
         merge_shapes: whether objects of one material become one; false keeps every object apart.
         skip_unreached: leave out links that no path reaches, instead of refusing the case.
@@ -102,10 +103,13 @@ class EffectsSection:
     Attributes:
         use: "all", names, or "package.module:effects" of the user's own.
         exclude: names of families or instances that are left out of these.
+        known: names of effects that the twin has beyond doubt, such as those that an earlier diagnosis found: they are
+            fitted with the model's other unknowns, and are no candidates.
     """
 
     use: str | tuple[str, ...] = "all"
     exclude: tuple[str, ...] = ()
+    known: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, kw_only=True)

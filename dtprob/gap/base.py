@@ -8,9 +8,9 @@ import jax
 import numpy as np
 
 from dtprob.effects.effect import effects_of
-from dtprob.errors import InputError
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
+from dtprob.gap.soundness import broken
 
 _PRIOR_DRAWS = 64
 _ANGLES = 8
@@ -39,7 +39,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         polished: how many of the fits, the best of each optimum, are freed from local optima.
 
     Raises:
-        InputError: the model has no finite likelihood from any start.
+        InputError: the model has no finite likelihood from any start; what breaks is named.
     """
     draws = problem.prior_draws(key, _PRIOR_DRAWS)
     added = [e.site_name(p.name) for e in effects_of(problem.model) for p in e.parameters]
@@ -54,12 +54,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         if len(values) > _ENOUGH and values[0] - values[_ENOUGH - 1] < _SAME:
             break
     if not fits:
-        raise InputError(
-            f"base model {problem.declaration.name}",
-            "a finite likelihood somewhere under its prior",
-            "none from any start",
-            "Check the units of the data and the priors of the model; dtprob.testing.check_model names what breaks.",
-        )
+        raise broken(problem, [np.median(draws, axis=0), *draws[: starts - 1]])
     found = _apart(fits)
     freed = [polish(problem, fitted) for fitted in found[:polished]]
     best = max([*freed, *found[polished:]], key=lambda f: f.log_posterior)

@@ -175,13 +175,12 @@ def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
                     "contraction": contraction[name][j],
                 }
             )
-    warnings = [] if fitted.converged else ["the fit of the base model had not converged"]
     return {
         "nuisances": nuisances,
         "converged": fitted.converged,
         "n_clusters": problem.n_cluster,
         "n_observations": problem.n_observation,
-        "warnings": warnings,
+        "warnings": list(evidence.notes),
     }
 
 

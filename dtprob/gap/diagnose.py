@@ -22,6 +22,7 @@ from dtprob.gap.problem import Problem
 from dtprob.gap.search import search
 from dtprob.gap.settings import Settings
 from dtprob.gap.shares import shares
+from dtprob.gap.soundness import idle, notes
 from dtprob.gap.trials import Say
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
@@ -86,7 +87,11 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     keys = jax.random.split(key, 4)
     say(f"fitting the base model to {problem.n_cluster} clusters")
     base = fit_base(problem, keys[0], polished=settings.polished)
+    noted = notes(problem, base)
+    for note in noted:
+        say(f"note: {note}")
     steps = search(problem, base, keys[1], settings, say)
+    noted = (*noted, *idle(steps[0].view.screening.absorbed_by))
     base, last = steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
     assignment = closed.folds(problem.n_cluster, keys[2], settings.folds)
@@ -102,7 +107,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     )
     held = held_before, held_after
     parts = shares(last.problem, last.fitted, held, assignment, keys[3]) if fraction is not None else ()
-    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts)
+    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts, noted)
 
 
 def _causes(

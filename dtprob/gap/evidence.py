@@ -16,7 +16,10 @@ from dtprob.gap.where import Location
 
 @dataclass(frozen=True)
 class Evidence:
-    """The base fit, the steps of the search and the held-out losses before and after the accepted effects."""
+    """The base fit, the steps of the search and the held-out losses before and after the accepted effects.
+
+    `notes` says what is wrong with the base fit itself.
+    """
 
     problem: Problem
     base: Fit
@@ -26,6 +29,7 @@ class Evidence:
     bracket: tuple[float, float]
     fraction: ClosedFraction | None
     shares: tuple[Share, ...]
+    notes: tuple[str, ...] = ()
 
     @property
     def before(self) -> Location:

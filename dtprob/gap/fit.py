@@ -124,6 +124,8 @@ def fit(
     active = activate(problem, effects, weights, spread)
     x, damping, converged = np.array(x, float), 1e-3, False
     value = _weighted(active, _objective(problem, active, x))
+    if value == -np.inf and not np.isfinite(problem.compiled.residual(x)).all():
+        return _hopeless(active, x)
     latest: Changes = {}
     for _ in range(steps):
         system = _system(problem, active, x)
@@ -140,6 +142,12 @@ def fit(
         if converged or not (better or change >= _SETTLED):
             break
     return _finish(problem, active, x, value, converged)
+
+
+def _hopeless(active: Active, x: np.ndarray) -> Fit:
+    """The fit of a starting point that leads nowhere, since the model is not finite there."""
+    index, names = active.global_index, tuple(e.name for e in active.effects)
+    return Fit(x, names, active.spread, -np.inf, -np.inf, np.eye(len(index)), index, False)
 
 
 class _Trial(NamedTuple):

@@ -25,6 +25,7 @@ from dtprob.gap.plausible import log_bayes_factor, scales
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
 from dtprob.gap.settings import Settings
+from dtprob.gap.soundness import UNSEEN
 from dtprob.gap.tails import (
     LOG_SMALLEST,
     family_wise,
@@ -209,7 +210,7 @@ def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Eff
     k = [e.name for e in scores.effects].index(effect.name)
     group = scores.groups[k]
     if scores.total[group].max(initial=0.0) == 0.0:
-        return "nothing observed depends on it"
+        return UNSEEN
     own = np.diag(scores.part(k))
     left = own / np.maximum(scores.total[group], 1e-300)
     if left.max() > 1 - _ABSORBED or (own * scales(scores.effects[k]) ** 2).max() > _SEEN:

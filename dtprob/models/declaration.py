@@ -215,7 +215,13 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
                 found[name] = site
 
     arrays, static = split_static(data)
-    jax.eval_shape(run, arrays, jax.random.key(0))
+    try:
+        jax.eval_shape(run, arrays, jax.random.key(0))
+    except NotImplementedError as error:
+        remedy = "Give every parameter a proper prior; a wide one will do"
+        raise InputError(
+            f"model {model_name(function)}", "distributions that can be drawn from", "one that cannot", remedy
+        ) from error
     declaration = Declaration(model_name(function), found, cluster or notes.cluster or _first_plate(found))
     if not declaration.observed:
         raise InputError(

@@ -15,7 +15,7 @@ import numpy as np
 from dtprob.case import Case, EngineSection
 from dtprob.data import ChannelData, Data, PowerData, Table, read, read_table
 from dtprob.data.location import located
-from dtprob.effects import Effect, catalogue, summaries
+from dtprob.effects import Effect, catalogue, summaries, with_effects
 from dtprob.errors import InputError, unknown_name
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
@@ -33,7 +33,7 @@ class Prepared:
 
     Attributes:
         case: where it comes from.
-        model: the generative model.
+        model: the generative model, extended by the effects that the case says are known.
         data: its arguments by name.
         reference: the arguments that the twin was learned from, if the case names them.
         designs: arguments for measurements that could be made, by name.
@@ -105,6 +105,7 @@ def prepare(
             say(f"reading {case.data.designs.name}")
             designs = {case.data.designs.stem: _arguments(case, model, case.data.designs, cache, say)}
         effects = _effects(case, model, arguments)
+    model = _extended(case, model, arguments)
     key, digest = jax.random.key(case.seed.value), sha256(case.data.file)
     cluster = case.data.cluster
     return Prepared(case, model, arguments, reference, designs, effects, engine, key, cluster, digest)
@@ -262,7 +263,30 @@ def _effects(case: Case, model: Model, arguments: Mapping[str, Any]) -> tuple[Ef
     for name in left_out:
         if name not in known:
             raise unknown_name(f"{case.path.name} [effects] exclude", name, known, "effect")
-    return tuple(effect for effect in offered if not {effect.family, effect.name} & set(left_out))
+    left_out = {*left_out, *case.effects.known}
+    return tuple(effect for effect in offered if not {effect.family, effect.name} & left_out)
+
+
+def _extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
+    """The model with the effects that are known, their parameters among its unknowns."""
+    if not case.effects.known:
+        return model
+    where = f"{case.path.name} [effects] known"
+    sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
+    use = case.effects.use
+    own = [e for n in ((use,) if isinstance(use, str) else use) if ":" in n for e in _own_effects(n, case)]
+    named = {effect.name: effect for effect in own if isinstance(effect, Effect)}
+    added: list[Effect] = []
+    for name in case.effects.known:
+        offered = {e.name: e for e in catalogue(sites, arguments, [named.get(name, name)])}
+        if name not in offered:
+            remedy = "Name one of the instances"
+            raise InputError(where, f"one effect ({', '.join(list(offered)[:8])})", repr(name), remedy)
+        if offered[name].kind == "variance":
+            expected = "effects with parameters of their own"
+            raise InputError(where, expected, f"the random field {name}", "Leave it among the candidates")
+        added.append(offered[name])
+    return with_effects(model, added)
 
 
 def _axis(case: Case, arguments: Mapping[str, Any]) -> str | None:
