@@ -15,8 +15,11 @@ from dtprob.effects.effect import FIELD, Effect
 
 _FEATURES: Final = 16
 """Features, the first ones, whose regions are looked at."""
-_CELLS: Final = 6
-"""Cells of an old map along each of the two first features."""
+_POINTS: Final = 64
+"""Points at which the errors of an old map are drawn."""
+_JITTER: Final = 1e-6
+_REACH: Final = 1.0
+"""Distance, in standard deviations of the features, at which the errors of an old map have forgotten one another."""
 
 type Weight = Callable[[Any], Float[Array, " sample"]]
 
@@ -86,16 +89,15 @@ def label_noise(sites: Sites, data: Data) -> list[Effect]:
 
 
 def stale_map(sites: Sites, data: Data) -> list[Effect]:
-    """The map behind the predictor is old: each cell of it is off by a random constant of its own."""
+    """The map behind the predictor is old: whole districts of it are off, each by an amount of its own."""
     if not offers(sites, "predicted_label"):
         return []
-    edges = [_quantiles(column, _CELLS) for column in np.asarray(data["x"], float).T[:2]]
+    field = _districts(np.asarray(data["x"], float)[:, :2])
+    if field is None:
+        return []
 
     def shift(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        x, cell = jnp.asarray(context["x"]), jnp.zeros(value.shape[0], int)
-        for feature, edge in enumerate(edges):
-            cell = cell * _CELLS + jnp.searchsorted(jnp.asarray(edge), x[:, feature])
-        return value + p["scale"] * p[FIELD].reshape(-1)[cell]
+        return value + p["scale"] * field(context["x"]) @ p[FIELD].reshape(-1)
 
     return [
         Effect(
@@ -103,13 +105,43 @@ def stale_map(sites: Sites, data: Data) -> list[Effect]:
             {"predicted_label": shift},
             (half_normal("scale", _unit(data)),),
             kind="variance",
-            physics=f"A random offset in each of {_CELLS} cells along the first feature"
-            + (f" times {_CELLS} along the second." if len(edges) > 1 else "."),
-            source="y + s z_cell, z standard normal; cells hold equally many samples.",
+            physics="Errors that neighbours in the first two features share and distant places do not, with sudden steps.",
+            source="y + s f(x), f Gaussian of correlation exp(-r), r the distance in standard deviations of the features; "
+            f"drawn at {_POINTS} points at most and kriged between (Rasmussen & Williams 2006, 4.2 and 8.3).",
             requires=("x",),
-            field_shape=lambda *_: (1, _CELLS ** len(edges)),
+            field_shape=lambda *_: (1, min(_POINTS, len(data["x"]))),
         )
     ]
+
+
+def _districts(
+    x: Float[np.ndarray, "sample feature"],
+) -> Callable[[Any], Float[Array, "sample point"]] | None:
+    """What independent normal draws at points have to be multiplied by, at features, for an exponential correlation."""
+    spread = x.std(axis=0)
+    kept = np.flatnonzero(spread > 0)
+    if not len(kept):
+        return None
+    unit = spread[kept] * _REACH
+    points = _spread_out(x[:, kept] / unit)
+    between = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    root = np.linalg.cholesky(np.exp(-between) + _JITTER * np.eye(len(points)))
+
+    def weights(features: Any) -> Float[Array, "sample point"]:
+        place = features[:, kept] / unit
+        square = jnp.sum((place[:, None] - points[None]) ** 2, axis=-1)
+        return jax.scipy.linalg.solve_triangular(root, jnp.exp(-jnp.sqrt(square)).T, lower=True).T
+
+    return weights
+
+
+def _spread_out(place: Float[np.ndarray, "sample feature"]) -> Float[np.ndarray, "point feature"]:
+    """Points that cover the samples evenly: each next one is the sample farthest from those before."""
+    chosen, distance = [0], np.linalg.norm(place - place[0], axis=1)
+    while len(chosen) < min(_POINTS, len(place)):
+        chosen.append(int(np.argmax(distance)))
+        distance = np.minimum(distance, np.linalg.norm(place - place[chosen[-1]], axis=1))
+    return place[chosen]
 
 
 def _unit(data: Data) -> float:

@@ -16,6 +16,7 @@ from dtprob.effects.network.laws import (
     clusters_of,
     last_arrival,
     mix,
+    of_device,
     progress,
     same_arrival,
     thinned,
@@ -60,24 +61,30 @@ def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
     clusters = _clusters(sites, data)
     if clusters is None:
         return []
-    chosen = [(None, np.ones(clusters.devices, dtype=bool))]
-    chosen += [(f"device_{k}", at(k, clusters.devices)) for k in range(clusters.devices)]
-    effects: list[Effect] = []
-    for instance, devices in chosen:
-        count = _count(clusters, devices)
+    total = _count(clusters)
+    effects = [
+        Effect(
+            "arrival_rate_shift",
+            {"arrival_logits": lambda value, p, _: value + p["log_odds"] * total},
+            (normal("log_odds", 1.0),),
+            physics="The odds of an arrival at all devices change by a factor.",
+            source="Exponential tilt of the joint arrivals: P(a) exp(c n(a)).",
+            requires=("clusters",),
+        )
+    ]
+    for device in range(clusters.devices):
 
-        def tilt(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], count: Any = count) -> Any:
-            return value + p["log_odds"] * count
+        def tilt(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
+            return of_device(value, clusters, device, p["log_odds"])
 
-        who = "all devices" if instance is None else instance.replace("_", " ")
         effects.append(
             Effect(
                 "arrival_rate_shift",
                 {"arrival_logits": tilt},
                 (normal("log_odds", 1.0),),
-                instance=instance,
-                physics=f"The odds of an arrival at {who} change by a factor.",
-                source="Exponential tilt of the joint arrivals: P(a) exp(c n(a)).",
+                instance=f"device_{device}",
+                physics=f"The odds of an arrival at device {device} change by a factor.",
+                source="Tilt of P(a_k | the others), which leaves the others' arrivals as they are.",
                 requires=("clusters",),
             )
         )
@@ -91,17 +98,10 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
         return []
     effects: list[Effect] = []
     for device in range(clusters.devices):
-        count = _count(clusters, at(device, clusters.devices))
 
-        def follow(
-            value: Any,
-            p: Mapping[str, Any],
-            context: Mapping[str, Any],
-            device: int = device,
-            count: Any = count,
-        ) -> Any:
-            last = last_arrival(context, clusters, device)
-            return value + p["log_odds"] * last[..., None, None] * count
+        def follow(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], device: int = device) -> Any:
+            last = last_arrival(context, clusters, device) - 0.5
+            return of_device(value, clusters, device, p["log_odds"] * last[..., None])
 
         effects.append(
             Effect(
@@ -110,11 +110,11 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
                 (normal("log_odds", 1.0),),
                 instance=f"device_{device}",
                 physics=f"An arrival at device {device} changes the odds of one in the next slot.",
-                source="First-order Markov dependence: P(a) exp(c a_k (a_k[t-1] - 1/2)).",
+                source="First-order Markov dependence: P(a_k | the others) tilted by c (a_k[t-1] - 1/2).",
                 requires=("clusters", "previous"),
             )
         )
-    total = _count(clusters, np.ones(clusters.devices, dtype=bool))
+    total = _count(clusters)
     effects.append(
         Effect(
             "bursty_traffic",
@@ -150,20 +150,21 @@ def cross_cluster_traffic(sites: Sites, data: Data) -> list[Effect]:
 
 def _coupled(clusters: ClustersLike, i: int, j: int, *, same: bool) -> Effect:
     """Device i's arrival, in this slot or the one before, changes the odds of device j's."""
-    count = _count(clusters, at(j, clusters.devices))
-    cause = same_arrival if same else last_arrival
+    # A packet of the slot before may be passed on, which only adds; in the same slot neither comes first.
+    cause, at_rest = (same_arrival, 0.5) if same else (last_arrival, 0.0)
 
     def couple(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        return value + p["log_odds"] * cause(context, clusters, i)[..., None, None] * count
+        last = cause(context, clusters, i) - at_rest
+        return of_device(value, clusters, j, p["log_odds"] * last[..., None])
 
-    when, at_slot = ("the same slot", "t") if same else ("the slot before", "t-1")
+    when, law = ("the same slot", "(a_i[t] - 1/2)") if same else ("the slot before", "a_i[t-1]")
     return Effect(
         "cross_cluster_traffic",
         {"arrival_logits": couple},
         (normal("log_odds", 1.0),),
         instance=f"{i}_with_{j}" if same else f"{i}_to_{j}",
         physics=f"An arrival at device {i} in {when} changes the odds of one at device {j}.",
-        source=f"Log-linear interaction: P(a) exp(c a_j (a_i[{at_slot}] - 1/2)).",
+        source=f"Log-linear interaction: P(a_j | the others) tilted by c {law}.",
         requires=("clusters", "arrivals" if same else "previous"),
     )
 
@@ -175,10 +176,9 @@ def drift(sites: Sites, data: Data) -> list[Effect]:
         return []
     effects: list[Effect] = []
     for device in range(clusters.devices):
-        count = _count(clusters, at(device, clusters.devices))
 
-        def slope(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], count: Any = count) -> Any:
-            return value + p["log_odds"] * progress(value.shape[0])[..., None, None] * count
+        def slope(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
+            return of_device(value, clusters, device, p["log_odds"] * progress(value.shape[0])[..., None])
 
         effects.append(_drift({"arrival_logits": slope}, f"device_{device}", f"arrivals at device {device}"))
     if offers(sites, "reception_logits"):
@@ -205,9 +205,9 @@ def _clusters(sites: Sites, data: Data) -> ClustersLike | None:
     return clusters_of(data) if offers(sites, "arrival_logits") else None
 
 
-def _count(clusters: ClustersLike, devices: Any) -> Any:
-    """How many of some devices have an arrival, (cluster, outcome)."""
-    return (clusters.arrives * np.asarray(devices)[:, None]).sum(axis=1).astype(float)
+def _count(clusters: ClustersLike) -> Any:
+    """How many devices have an arrival, (cluster, outcome)."""
+    return clusters.arrives.sum(axis=1).astype(float)
 
 
 FAMILIES: Final[dict[str, Family]] = {

@@ -56,6 +56,27 @@ def mix(
     return logits + jnp.log(jnp.exp(-amount) - jnp.expm1(-amount) * other / jnp.maximum(p, _LEAST))
 
 
+def tilted(
+    logits: Float[Array, "*batch outcome"], bit: int, log_odds: Float[Array, "*batch"] | Any
+) -> Float[Array, "*batch outcome"]:
+    """Logits of joint arrivals when the odds of one device's, given the others', change by a factor.
+
+    The other devices go on as before: the law of their arrivals stays the same.
+
+    Args:
+        logits: of the joint arrivals, up to a constant.
+        bit: binary digit of the device in the number of an outcome.
+        log_odds: logarithm of the factor, broadcasting to the batch.
+    """
+    p = jax.nn.softmax(logits)
+    outcome = np.arange(p.shape[-1])
+    partner = p[..., outcome ^ bit]
+    up = jnp.exp(jnp.asarray(log_odds))[..., None]
+    own, other = jnp.where(outcome & bit, up, 1.0), jnp.where(outcome & bit, 1.0, up)
+    ratio = own * (p + partner) / jnp.maximum(own * p + other * partner, _LEAST)
+    return logits + jnp.log(jnp.where(p + partner > 0, ratio, 1.0))
+
+
 def thinned(logits: Float[Array, "*batch outcome"], bit: int) -> Float[Array, "*batch outcome"]:
     """Probabilities of joint arrivals when the device of a binary digit generates nothing."""
     p = jax.nn.softmax(logits)
@@ -74,24 +95,40 @@ def at(index: int, size: int) -> Bool[np.ndarray, " n"]:
     return np.arange(size) == index
 
 
+def of_device(
+    logits: Float[Array, "*batch cluster outcome"], clusters: ClustersLike, device: int, log_odds: Any
+) -> Float[Array, "*batch cluster outcome"]:
+    """Logits of all clusters' arrivals, `tilted` in the one that a device belongs to.
+
+    Args:
+        logits: of the joint arrivals of each cluster.
+        clusters: of the network.
+        device: whose odds change.
+        log_odds: logarithm of the factor, broadcasting to (*batch, cluster).
+    """
+    cluster = int(clusters.cluster_of[device])
+    moved = tilted(logits, int(clusters.weight[cluster, device]), log_odds)
+    return jnp.where(at(cluster, logits.shape[-2])[:, None], moved, logits)
+
+
 def last_arrival(
     data: Mapping[str, Any], clusters: ClustersLike, device: int
 ) -> Float[Array, "episode slot"]:
-    """1/2 where the device had an arrival at the end of the slot before, else -1/2."""
-    return _centred(data["previous"], clusters, device)
+    """1 where the device had an arrival at the end of the slot before, else 0."""
+    return _has(data["previous"], clusters, device)
 
 
 def same_arrival(
     data: Mapping[str, Any], clusters: ClustersLike, device: int
 ) -> Float[Array, "episode slot"]:
-    """1/2 where the device has an arrival at the end of this slot, else -1/2."""
-    return _centred(data["arrivals"], clusters, device)
+    """1 where the device has an arrival at the end of this slot, else 0."""
+    return _has(data["arrivals"], clusters, device)
 
 
-def _centred(joint: Any, clusters: ClustersLike, device: int) -> Float[Array, "episode slot"]:
+def _has(joint: Any, clusters: ClustersLike, device: int) -> Float[Array, "episode slot"]:
     cluster = int(clusters.cluster_of[device])
     bit = int(clusters.weight[cluster, device])
-    return jnp.where(jnp.asarray(joint)[..., cluster] & bit, 0.5, -0.5)
+    return jnp.where(jnp.asarray(joint)[..., cluster] & bit, 1.0, 0.0)
 
 
 def progress(windows: int) -> Float[np.ndarray, "window 1"]:

@@ -14,6 +14,9 @@ from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offe
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.network.laws import at, mix
 
+_MEMORY: Final = 0.7
+"""Share of what was heard that is still remembered a slot later."""
+
 type Other = Callable[[Any, Mapping[str, Any]], Float[Array, "episode slot delivery_count"]]
 
 
@@ -89,21 +92,24 @@ def near_far(sites: Sites, _data: Data) -> list[Effect]:
 
 
 def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
-    """The channel has good and bad times: a slot is like the one before, or windows differ."""
+    """The channel has good and bad times: slots are like those before, or windows differ."""
     if not offers(sites, "reception_logits"):
         return []
 
     def follow(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        return value + p["log_odds"] * _heard_before(context)[..., None] * np.arange(value.shape[-1])
+        silence = jnp.broadcast_to(at(0, value.shape[-1]).astype(float), value.shape)
+        tilt = p["memory"] * _heard_before(context)[..., None] * np.arange(value.shape[-1])
+        return mix(value, silence, p["loss"]) + tilt
 
     effects = [
         Effect(
             "bursty_channel",
             {"reception_logits": follow},
-            (normal("log_odds", 1.0),),
-            physics="The odds of a delivery depend on whether the senders of the slot before were heard.",
-            source="First-order surrogate of the Gilbert-Elliott channel: P(d) exp(c d (heard[t-1] - 1/2)).",
-            requires=("sending", "deliveries"),
+            (half_normal("loss", 0.5), normal("memory", 5.0)),
+            physics="Nothing is heard in a share 1 - exp(-loss) of the slots, and more after more than expected was heard.",
+            source="Observation-driven surrogate of the Gilbert-Elliott channel (Davis, Dunsmuir & Streett 2003): "
+            f"P(d) exp(c d m), m[t] = {_MEMORY} m[t-1] + {1 - _MEMORY:.1f} (heard[t-1] - expected).",
+            requires=("sending", "deliveries", "log_reception"),
         )
     ]
     effects.append(
@@ -260,10 +266,15 @@ def _next(mass: Float[Array, "*batch delivery_count"]) -> Float[Array, "*batch d
 
 
 def _heard_before(context: Mapping[str, Any]) -> Float[Array, "episode slot"]:
-    """Share of the senders of the slot before that were delivered, less 1/2; 0 where none sent or none is known."""
+    """How many more slots with senders than expected were heard, as a fading mean over the slots before; 0 at first."""
     senders = _senders(context)
-    heard = jnp.where(senders > 0, jnp.asarray(context["deliveries"]) / jnp.maximum(senders, 1) - 0.5, 0.0)
-    return jnp.concatenate([jnp.zeros_like(heard[:, :1]), heard[:, :-1]], axis=1)
+    expected = 1.0 - jnp.exp(context["log_reception"][:, 0])[senders]
+    more = jnp.where(senders > 0, (jnp.asarray(context["deliveries"]) > 0) - expected, 0.0)
+
+    def pass_on(mean: Array, new: Array) -> tuple[Array, Array]:
+        return _MEMORY * mean + (1 - _MEMORY) * new, mean
+
+    return jax.lax.scan(pass_on, jnp.zeros_like(more[:, 0]), more.T)[1].T
 
 
 FAMILIES: Final[dict[str, Family]] = {
