@@ -101,10 +101,10 @@ class Effect:
         source: where the formula comes from.
         requires: names of data or sites that the rewrites look up in the context.
         distributions: for each sampled site (an observation, mostly), the function (distribution, parameters,
-            context) -> new distribution of the same batch and event shape. Only for effects of kind "mean".
+            context) -> new distribution of the same batch and event shape.
         field_shape: shape of the field of a "variance" effect from the value of its first site and the
-            context; by default that of the value. The leading axes are the site's (full size, or 1 where the
-            field is shared along the axis), further axes are free.
+            context; by default that of the value, to be given where a distribution is rewritten. The leading
+            axes are the site's (full size, or 1 where the field is shared along the axis), further axes are free.
     """
 
     family: str
@@ -128,12 +128,13 @@ class Effect:
         if not names or len(set(names)) < len(names):
             got = ", ".join(names) or "none"
             raise InputError(f"effect {self.name}", "parameters of different names", got, "Name each once.")
-        if self.kind == "variance" and (len(names) != 1 or self.distributions):
+        shapeless = bool(self.distributions) and self.field_shape is None
+        if self.kind == "variance" and (len(names) != 1 or shapeless):
             raise InputError(
                 f"variance effect {self.name}",
-                "one parameter, the field's standard deviation, and deterministic sites only",
+                "one parameter, the field's standard deviation, and a field_shape where it rewrites a distribution",
                 f"{', '.join(names)}; distributions of {', '.join(self.distributions) or 'no site'}",
-                "Split it into several effects, or make it a mean effect.",
+                "Split it into several effects, say the shape of its field, or make it a mean effect.",
             )
 
     @property
@@ -212,7 +213,7 @@ class Rewriting(Messenger):
             if msg["type"] == "sample":
                 rewrite = effect.distributions.get(msg["name"])
                 if rewrite is not None:
-                    msg["fn"] = rewrite(msg["fn"], self._parameters[effect.name], context)
+                    msg["fn"] = rewrite(msg["fn"], self._given(effect, msg, context), context)
             elif (rewrite := effect.rewrites.get(msg["name"])) is not None:
                 value = rewrite(msg["value"], self._given(effect, msg, context), context)
                 msg["value"] = _fit(effect.name, msg["name"], msg["value"], value)

@@ -6,10 +6,12 @@ error is not credited to an effect. The interval is a paired bootstrap over clus
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import jax
 import numpy as np
+from numpy.typing import ArrayLike
 
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
@@ -48,20 +50,36 @@ def folds(n_cluster: int, key: jax.Array, n_folds: int) -> np.ndarray:
     return assignment
 
 
+type Fold = tuple[np.ndarray, fitting.Fit]
+"""Which clusters (cluster,) were left out, and the fit to the others."""
+
+
 def cross_fit(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> HeldOut:
     """Refit without each fold in turn, and judge the fold."""
-    log_likelihood, error, signal = (np.zeros(problem.n_cluster) for _ in range(3))
-    blocks = [b for name in fitted.effects for b in problem.blocks_of(name) if not b.local]
-    estimates: dict[str, list[np.ndarray]] = {b.name: [] for b in blocks}
+    return judged(problem, fold_fits(problem, fitted, assignment))
+
+
+def fold_fits(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> Iterator[Fold]:
+    """Refit without each fold in turn."""
     for fold in np.unique(assignment):
         held = assignment == fold
         kept = (~held).astype(float)
-        part = fitting.fit(problem, fitted.x, fitted.effects, weights=kept, spread=fitted.spread, steps=15)
+        yield (
+            held,
+            fitting.fit(problem, fitted.x, fitted.effects, weights=kept, spread=fitted.spread, steps=15),
+        )
+
+
+def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
+    """How fits do on the clusters that each of them has not seen."""
+    log_likelihood, error, signal = (np.zeros(problem.n_cluster) for _ in range(3))
+    estimates: dict[str, list[np.ndarray]] = {}
+    for held, part in folds:
         log_likelihood[held] = fitting.marginal(problem, part)[held]
         squares = [np.asarray(v) for v in problem.compiled.prediction_error(part.x)]
         error[held], signal[held] = squares[0][held], squares[1][held]
-        for block in blocks:
-            estimates[block.name].append(part.x[block.index[0]])
+        for block in (b for name in part.effects for b in problem.blocks_of(name) if not b.local):
+            estimates.setdefault(block.name, []).append(part.x[block.index[0]])
     return HeldOut(log_likelihood, error, signal, {n: np.stack(v) for n, v in estimates.items()})
 
 
@@ -98,19 +116,37 @@ def closed_fraction(
         key: for the bootstrap over clusters.
         draws: bootstrap draws.
     """
-    gain = after.log_likelihood - before.log_likelihood
-    n = len(gain)
-    rest = np.array(bracket) - float(after.log_likelihood.sum())
-    index = np.asarray(jax.random.randint(key, (draws, n), 0, n))
-    totals = gain[index].sum(1)
+    gain, totals = _gains(before, after, key, draws)
     if gain.sum() <= 0 or np.quantile(totals, 0.05) <= 0:
         return None
-    share = np.asarray(jax.random.uniform(jax.random.fold_in(key, 1), (draws,)))
-    remainder = rest[0] + share * (rest[1] - rest[0])
-    fractions = totals / (totals + np.maximum(remainder, 0.0))
-    low, high = np.quantile(fractions, [0.05, 0.95])
-    centre = float(gain.sum() / (gain.sum() + max(float(rest.mean()), 0.0)))
+    return share(before, after, bracket, key, draws)
+
+
+def share(
+    before: HeldOut, after: HeldOut, bracket: tuple[float, float], key: jax.Array, draws: int = 2000
+) -> ClosedFraction:
+    """The closed fraction of a gap that is known to be there, below zero where the loss grows; see `closed_fraction`."""
+    gain, totals = _gains(before, after, key, draws)
+    rest = np.array(bracket) - float(after.log_likelihood.sum())
+    part = np.asarray(jax.random.uniform(jax.random.fold_in(key, 1), (draws,)))
+    remainder = rest[0] + part * (rest[1] - rest[0])
+    low, high = np.quantile(_fraction(totals, remainder), [0.05, 0.95])
+    centre = float(_fraction(gain.sum(), rest.mean()))
     return ClosedFraction(float(np.clip(centre, low, high)), float(low), float(high))
+
+
+def _fraction(gain: ArrayLike, rest: ArrayLike) -> np.ndarray:
+    """What a gain closes where a rest is left, -1 at worst."""
+    gain = np.asarray(gain)
+    whole = np.maximum(np.maximum(gain, 0.0) + np.maximum(rest, 0.0), np.abs(gain))
+    return gain / np.maximum(whole, 1e-300)
+
+
+def _gains(before: HeldOut, after: HeldOut, key: jax.Array, draws: int) -> tuple[np.ndarray, np.ndarray]:
+    """Gain of each cluster, and its totals over bootstrap draws of the clusters."""
+    gain = after.log_likelihood - before.log_likelihood
+    index = np.asarray(jax.random.randint(key, (draws, len(gain)), 0, len(gain)))
+    return gain, gain[index].sum(1)
 
 
 def error_db(problem: Problem, result: HeldOut) -> float | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import jax
@@ -36,6 +37,7 @@ def compose(
             "p_value": evidence.after.site_p_value,
             "sites": [s.site for s in evidence.after.sites if s.p_value <= settings.level / 2],
         },
+        "remainder": _remainder(evidence),
         "detectable": [
             {"effect": name, "size": size, "parameter": e.parameters[0].name, "unit": e.parameters[0].unit}
             for name, size, e in zip(first.names, first.detectable, evidence.problem.effects, strict=True)
@@ -123,6 +125,21 @@ def _gap(evidence: Evidence) -> dict[str, Any]:
         "after": after,
         "floor": [0.0, max((best - evidence.bracket[0]) / n, 0.0)],
         "in_user_terms": terms,
+    }
+
+
+def _remainder(evidence: Evidence) -> dict[str, Any] | None:
+    """How far a model of what is left, at its site, carries on held-out clusters."""
+    found = evidence.remainder
+    if found is None:
+        return None
+    gain = float((found.held.log_likelihood - evidence.held_after.log_likelihood).sum())
+    return {
+        "terms": [asdict(term) for term in found.terms],
+        "closed_fraction": asdict(found.closed),
+        "gain_nats": gain,
+        "before": asdict(found.before),
+        "after": asdict(found.after),
     }
 
 

@@ -19,6 +19,7 @@ from dtprob.gap.design_data import next_measurement
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.problem import Problem
+from dtprob.gap.remainder import model_remainder
 from dtprob.gap.search import search
 from dtprob.gap.settings import Settings
 from dtprob.gap.shares import shares
@@ -95,10 +96,11 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     base, last = steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
     assignment = closed.folds(problem.n_cluster, keys[2], settings.folds)
-    held_before = closed.cross_fit(steps[0].view.problem, base, assignment)
-    held_after = (
-        closed.cross_fit(last.problem, last.fitted, assignment) if last.fitted.effects else held_before
-    )
+    folds = list(closed.fold_fits(steps[0].view.problem, base, assignment))
+    held_before = held_after = closed.judged(steps[0].view.problem, folds)
+    if last.fitted.effects:
+        folds = list(closed.fold_fits(last.problem, last.fitted, assignment))
+        held_after = closed.judged(last.problem, folds)
     remains = last.location.site_p_value <= settings.level / 2
     left = max((s.gain for s in last.location.sites), default=0.0) if remains else 0.0
     bracket = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
@@ -107,7 +109,13 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     )
     held = held_before, held_after
     parts = shares(last.problem, last.fitted, held, assignment, keys[3]) if fraction is not None else ()
-    return Evidence(problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts, noted)
+    rest = None
+    if remains and (fraction is None or fraction.mean < 1 - settings.minor):
+        say("modelling what is left at its site")
+        rest = model_remainder(last, folds, held_after, bracket[1], keys[3])
+    return Evidence(
+        problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts, noted, remainder=rest
+    )
 
 
 def _causes(

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from dtprob.gap.closed import ClosedFraction, HeldOut
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
+from dtprob.gap.remainder import Remainder
 from dtprob.gap.search import Step
 from dtprob.gap.shares import Share
 from dtprob.gap.trials import Start
@@ -30,6 +31,7 @@ class Evidence:
     fraction: ClosedFraction | None
     shares: tuple[Share, ...]
     notes: tuple[str, ...] = ()
+    remainder: Remainder | None = None
 
     @property
     def before(self) -> Location:

@@ -6,12 +6,15 @@ One-sided second-order score tests, each with a few weightings of the field's en
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
 from dtprob.gap.tails import family_wise, field_log_bayes_factor, gamma_tail
+
+_SPREADS: Final = np.geomspace(1e-2, 1e3, 51)
+"""Spreads that are tried, in units of what a weight of middling information is known to."""
 
 
 class FieldTests(NamedTuple):
@@ -56,3 +59,25 @@ def field_tests(
     return FieldTests(
         np.array(smallest), np.array(p_value), np.array(z), np.array(bayes), np.min(replicates, axis=0)
     )
+
+
+def common_spread(
+    scores: Float[np.ndarray, " weight"], information: Float[np.ndarray, " weight"]
+) -> tuple[float, float]:
+    """Standard deviation of independent normal weights with the largest evidence, and its log Bayes factor.
+
+    log BF(s) = 1/2 sum_k (s^2 u_k^2 / (1 + s^2 J_k) - log(1 + s^2 J_k)).
+
+    Args:
+        scores: u, of the weights at zero.
+        information: J of each weight.
+    """
+    seen = information > 1e-12 * max(float(information.max(initial=0.0)), 1e-300)
+    if not seen.any():
+        return 0.0, 0.0
+    u, j = scores[seen], information[seen]
+    spread = _SPREADS[:, None] / np.sqrt(np.median(j))
+    inflated = 1 + spread**2 * j
+    evidence = 0.5 * (spread**2 * u**2 / inflated - np.log(inflated)).sum(axis=1)
+    best = int(evidence.argmax())
+    return float(spread[best, 0]), max(float(evidence[best]), 0.0)

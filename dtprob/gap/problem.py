@@ -62,6 +62,7 @@ class Problem:
         self._check_effects()
         self._column = column
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.per_cluster: frozenset[str] = frozenset()
         self.set_live(())
         if reference is not None:
             self.known = normal_of(self._reference_draws(reference))
@@ -94,6 +95,21 @@ class Problem:
         _ = self.programs, self.float_sites, self.field_shapes  # made once, then shared
         other = copy(self)
         other.set_live(tuple(e for e in self.effects if e.name in names))
+        return other
+
+    def with_fields(self, fields: Sequence[Effect], per_cluster: Sequence[str] = ()) -> Problem:
+        """The same problem with more variance effects, live beside those that are; no other is a candidate any more.
+
+        Args:
+            fields: the effects.
+            per_cluster: names of those whose field has a row for each cluster, whatever the axes of the site.
+        """
+        _ = self.float_sites  # as the candidates have grown them
+        other = copy(self)
+        other.effects, other.per_cluster = (*self.live, *fields), frozenset(per_cluster)
+        for name in ("programs", "field_shapes"):
+            other.__dict__.pop(name, None)
+        other.set_live(other.effects)
         return other
 
     @cached_property
@@ -204,7 +220,7 @@ class Problem:
     @cached_property
     def field_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of the field of each variance effect."""
-        fields = [e for e in self.effects if e.kind == "variance" and e.sites[0] in self.float_sites]
+        fields = [e for e in self.effects if e.kind == "variance"]
 
         def run(arrays: Any) -> dict[str, jax.Array]:
             data = eqx.combine(arrays, self._static)
@@ -212,8 +228,9 @@ class Problem:
             context = Context(data, {n: m["value"] for n, m in trace.items()})
             shapes = {}
             for effect in fields:
-                grown = self.float_sites[effect.sites[0]]
-                value = jnp.broadcast_to(trace[effect.sites[0]]["value"], grown.shape)
+                value = trace[effect.sites[0]]["value"]
+                grown = self.float_sites.get(effect.sites[0])
+                value = value if grown is None else jnp.broadcast_to(value, grown.shape)
                 shapes[effect.name] = jnp.zeros(effect.shape_of_field(value, context))
             return shapes
 
@@ -253,11 +270,14 @@ class Problem:
             )
         for effect in self.live:
             if effect.kind == "variance":
-                name, axes = effect.site_name(FIELD), self.declaration.sites[effect.sites[0]].axes
-                entries.append((name, effect.name, self.field_shapes[effect.name], axes))
+                own = (str(self.declaration.cluster),)
+                axes = (
+                    own if effect.name in self.per_cluster else self.declaration.sites[effect.sites[0]].axes
+                )
+                entries.append((effect.site_name(FIELD), effect.name, self.field_shapes[effect.name], axes))
             else:
                 entries += [(effect.site_name(p.name), effect.name, p.shape, ()) for p in effect.parameters]
-        return make_layout(entries, self.declaration.cluster, self.rows.n_cluster)
+        return make_layout(entries, str(self.declaration.cluster), self.rows.n_cluster)
 
     # -- points ---------------------------------------------------------------------------------------------------
 

@@ -17,6 +17,7 @@ import numpy as np
 from dtprob.gap.bootstrap import Replicates
 from dtprob.gap.curves import curves
 from dtprob.gap.families import Family, Site, deterministic, families, observed, shifted
+from dtprob.gap.fields import common_spread
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
@@ -26,6 +27,9 @@ _SURE = 0.005
 """Probability below which a site is surely wrong."""
 _CHANCE = 8
 """Replicates that tell what a site would gain by chance."""
+_MOST_SUSPECTS = 12
+_MOST_WEIGHTS = 4096
+"""Suspects of a site that are kept, and weights that one of them may have."""
 
 
 @dataclass(frozen=True)
@@ -66,13 +70,33 @@ class CoordinateFinding:
 
 
 @dataclass(frozen=True)
+class Suspect:
+    """A way of varying a surely wrong site, with random weights of a common spread.
+
+    Attributes:
+        site: its name.
+        rows: of an observation, its whitened components that move; None for a deterministic site.
+        family: what is added to the site, and how it varies.
+        spread: standard deviation of the weights with the largest evidence.
+        evidence: log Bayes factor of that spread against none, to first order, each weight apart.
+    """
+
+    site: str
+    rows: tuple[int, ...] | None
+    family: Family
+    spread: float
+    evidence: float
+
+
+@dataclass(frozen=True)
 class Location:
-    """Maps of the gap at one fit."""
+    """Maps of the gap at one fit; the suspects come in order of falling evidence."""
 
     sites: tuple[SiteFinding, ...]
     coordinates: tuple[CoordinateFinding, ...]
     axes: dict[str, np.ndarray]
     site_p_value: float
+    suspects: tuple[Suspect, ...] = ()
 
 
 def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> Location:
@@ -91,7 +115,29 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
     ]
     blocks, maps = _coordinates(problem, np.asarray(drawn.observed), np.asarray(drawn.projected))
     ordered = tuple(sorted(_spreads_last(findings), key=lambda f: (f.last, f.p_value, -f.gain)))
-    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0))
+    sure = {f.site for f in findings if f.p_value <= _SURE}
+    named = [
+        s
+        for site, tests in zip(found, tested, strict=True)
+        if site.name in sure
+        for s in _suspects(site, tests)
+    ]
+    suspects = tuple(sorted(named, key=lambda s: -s.evidence))
+    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0), suspects)
+
+
+def _suspects(site: Site, tests: Sequence[_Test]) -> list[Suspect]:
+    """The families of a site that have the most evidence."""
+    found = [s for s in (_suspect(site, test) for test in tests) if s is not None]
+    return sorted(found, key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
+
+
+def _suspect(site: Site, test: _Test) -> Suspect | None:
+    """A tested family as a suspect, if its evidence speaks for it."""
+    if test.variance.size > _MOST_WEIGHTS:
+        return None
+    spread, evidence = common_spread(test.first[0], test.variance)
+    return Suspect(site.name, site.rows, test.family, spread, evidence) if evidence > 0 else None
 
 
 def _spreads_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:

@@ -118,6 +118,33 @@ class Unlisted(TypedDict):
     sites: list[str | Site]
 
 
+class Term(TypedDict):
+    """A site and shape whose random weights are the model of what is left; `evidence` in nats, alone."""
+
+    site: str
+    shape: str
+    weights: int
+    per_cluster: bool
+    evidence: float
+
+
+class Calibration(TypedDict):
+    """On data left out: share inside the 90% predictive interval (null for discrete data), actual over predicted error."""
+
+    coverage: Probability | None
+    error_ratio: float
+
+
+class Remainder(TypedDict):
+    """What a model of the remainder at its site closes of what the causes leave, and predictions without and with it."""
+
+    terms: list[Term]
+    closed_fraction: Interval
+    gain_nats: float
+    before: Calibration
+    after: Calibration
+
+
 class Detectable(TypedDict):
     """The smallest size of an effect that would have been noticed; null where none would have been."""
 
@@ -166,6 +193,7 @@ class Report(TypedDict):
     where: Where
     gap: Gap
     unlisted: Unlisted
+    remainder: NotRequired[Remainder | None]
     next_measurement: str | dict[str, Any] | None
     detectable: list[Detectable]
     screening: NotRequired[list[Candidate]]

@@ -204,7 +204,7 @@ def test_dtype_stays_that_of_the_site():
         ({"rewrites": {}}, "a site to rewrite"),
         ({"parameters": ()}, "parameters of different names"),
         ({"parameters": BEND.parameters * 2}, "parameters of different names"),
-        ({"kind": "variance", "distributions": TAILS.distributions}, "deterministic sites only"),
+        ({"kind": "variance", "distributions": TAILS.distributions}, "a field_shape where it rewrites"),
     ],
 )
 def test_incomplete_declarations_are_refused(changes, message):

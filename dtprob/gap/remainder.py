@@ -1,0 +1,284 @@
+"""The unexplained rest of a gap, modelled at its site, so that predictions stay calibrated while its cause is unknown.
+
+The site families with the most evidence get random weights: normal, of a common standard deviation for each family, which
+is found by maximal evidence in a full refit. What is shared by all clusters carries over to new ones; what is each
+cluster's own, or a spread, widens the prediction there. Both are judged on clusters that were left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Final, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from scipy import sparse
+
+from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.gap import closed, whiten
+from dtprob.gap import fit as fitting
+from dtprob.gap.calibration import Calibration, calibration
+from dtprob.gap.closed import ClosedFraction, Fold, HeldOut
+from dtprob.gap.problem import Problem
+from dtprob.gap.view import View
+from dtprob.gap.where import Suspect
+
+_TRIED, _TAKEN = 6, 3
+"""Families that are tried, and modelled together, at most."""
+_WEIGHTS: Final = 96
+"""Weights shared by all clusters that a family may have."""
+_LEAST: Final = 3.0
+"""Nats of evidence that a family must bring."""
+_SAME: Final = 0.99
+"""Families of one pattern and nearly the same evidence are one thing under two names."""
+_NAME: Final = "remainder"
+_UNIT: Final = "scale"
+
+
+@dataclass(frozen=True)
+class Term:
+    """One family of the model of the remainder.
+
+    Attributes:
+        site: where it acts.
+        shape: what is added and how it varies, in words.
+        weights: how many random weights it has.
+        per_cluster: whether each cluster has weights of its own, which say nothing of new ones beyond their spread.
+        evidence: nats that it brings to first order, alone.
+    """
+
+    site: str
+    shape: str
+    weights: int
+    per_cluster: bool
+    evidence: float
+
+
+@dataclass(frozen=True)
+class Remainder:
+    """How a model of the remainder fares on clusters that were left out.
+
+    Attributes:
+        terms: of the model, the one with the most evidence first.
+        closed: share of what the causes leave that it closes; below zero if it makes predictions worse.
+        held: held-out results with it.
+        before, after: calibration of the predictions without and with it.
+    """
+
+    terms: tuple[Term, ...]
+    closed: ClosedFraction
+    held: HeldOut
+    before: Calibration
+    after: Calibration
+
+
+def model_remainder(
+    view: View, folds: Sequence[Fold], held: HeldOut, best: float, key: jax.Array
+) -> Remainder | None:
+    """Model what a fit leaves, and judge the model on held-out clusters; None where nothing can be modelled.
+
+    Args:
+        view: the fit with the accepted effects, and the families that are suspected there.
+        folds: which clusters are left out in turn, and the fits to the others.
+        held: held-out results of these.
+        best: the optimistic floor of the causes, total log likelihood.
+        key: for the bootstrap over clusters.
+    """
+    problem, fitted = view.problem, view.fitted
+    named = {f"{_NAME}[{i}]": s for i, s in enumerate(shortlist(problem, view.location.suspects))}
+    if not named:
+        return None
+    at = problem.compiled.sites(fitted.x)
+    positive = {s.site for s in named.values() if s.rows is None and _is_positive(at[s.site])}
+    fields = [field_of(problem, n, s, positive=s.site in positive) for n, s in named.items()]
+    own = [n for n, s in named.items() if _is_by_cluster(problem, s)]
+    wider = problem.with_fields(fields, own)
+    full = _forward(wider, replace(fitted, x=wider.translate(fitted.x, problem)), tuple(named))
+    taken = [n for n in named if n in full.effects]
+    if not taken:
+        return None
+    parts = list(closed.fold_fits(wider, full, np.sum([i * h for i, (h, _) in enumerate(folds)], axis=0)))
+    after = closed.judged(wider, parts)
+    reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
+    size = sum(_determined(wider, full, n) for n in taken)
+    bracket = reached, max(best, reached + 0.5 * size * len(parts) / (len(parts) - 1))
+    return Remainder(
+        tuple(_term(problem, named[n]) for n in taken),
+        closed.share(held, after, bracket, key),
+        after,
+        calibration(problem, folds),
+        calibration(wider, parts),
+    )
+
+
+def shortlist(problem: Problem, suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
+    """The families to try: most evidence first, each thing once."""
+    chosen: list[Suspect] = []
+    for suspect in sorted(suspects, key=lambda s: (-round(s.evidence, 3), s.rows is not None)):
+        size = 0 if _is_per_cluster(problem, suspect) else _size(problem, suspect)
+        label = suspect.family.pattern.label
+        known = [s for s in chosen if s.family.pattern.label == label]
+        same = any(s.site == suspect.site or suspect.evidence > _SAME * s.evidence for s in known)
+        if suspect.evidence >= _LEAST and not same and size <= _WEIGHTS:
+            chosen.append(suspect)
+    return tuple(chosen[:_TRIED])
+
+
+def _forward(problem: Problem, fitted: fitting.Fit, names: Sequence[str]) -> fitting.Fit:
+    """The fit with those of the fields that raise the evidence, each beside the ones before it."""
+    taken = 0
+    for name in names:
+        spread = {**fitted.spread, name: 1.0}
+        trial = fitting.fit(problem, fitted.x, (*fitted.effects, name), spread=spread)
+        if trial.log_evidence > fitted.log_evidence + _LEAST:
+            fitted, taken = trial, taken + 1
+        if taken == _TAKEN:
+            break
+    return fitted
+
+
+def _term(problem: Problem, suspect: Suspect) -> Term:
+    return Term(
+        suspect.site,
+        suspect.family.label,
+        _size(problem, suspect),
+        _is_per_cluster(problem, suspect),
+        suspect.evidence,
+    )
+
+
+def _determined(problem: Problem, fitted: fitting.Fit, name: str) -> float:
+    """Number of shared weights that the data determine."""
+    place = {int(i): j for j, i in enumerate(fitted.global_index)}
+    index = [place[int(i)] for b in problem.blocks_of(name) if not b.local for i in b.index[0]]
+    return float(np.sum(1 - np.diag(fitted.covariance)[index] / fitted.spread[name] ** 2))
+
+
+def _shape(problem: Problem, suspect: Suspect) -> tuple[int, ...]:
+    """Shape of the site."""
+    if suspect.rows is not None:
+        return problem.declaration.observed[suspect.site].shape
+    return tuple(problem.float_sites[suspect.site].shape)
+
+
+def _parts(suspect: Suspect, problem: Problem) -> int:
+    """Two for a complex site."""
+    if suspect.rows is not None:
+        return len(suspect.rows)
+    return 2 if jnp.issubdtype(problem.float_sites[suspect.site].dtype, jnp.complexfloating) else 1
+
+
+def _field_shape(problem: Problem, suspect: Suspect) -> tuple[int, ...]:
+    """Shape of the random weights: axes of the site, one of the curves, one of the parts."""
+    shape, parts, pattern = _shape(problem, suspect), _parts(suspect, problem), suspect.family.pattern
+    if pattern.curves is None:
+        return (*(n if i in pattern.kept else 1 for i, n in enumerate(shape)), parts)
+    n = cast("tuple[int, ...]", pattern.curves.shape)[0]
+    return (n, parts) if _is_by_cluster(problem, suspect) else (*(1 for _ in shape), n, parts)
+
+
+def _size(problem: Problem, suspect: Suspect) -> int:
+    return int(np.prod(_field_shape(problem, suspect), dtype=int))
+
+
+def _is_by_cluster(problem: Problem, suspect: Suspect) -> bool:
+    """Whether there is a curve for each cluster that a column of the data names."""
+    pattern = suspect.family.pattern
+    if pattern.curves is None or pattern.label != f"by {problem.cluster_name}":
+        return False
+    return cast("tuple[int, ...]", pattern.curves.shape)[0] == problem.n_cluster
+
+
+def _is_per_cluster(problem: Problem, suspect: Suspect) -> bool:
+    axes, pattern = problem.declaration.sites[suspect.site].axes, suspect.family.pattern
+    kept = [axes[i] for i in pattern.kept if i < len(axes)]
+    return _is_by_cluster(problem, suspect) or (
+        pattern.curves is None and problem.declaration.cluster in kept
+    )
+
+
+def _is_positive(value: jax.Array) -> bool:
+    return not jnp.iscomplexobj(value) and bool(jnp.all(value > 0))
+
+
+def field_of(problem: Problem, name: str, suspect: Suspect, *, positive: bool) -> Effect:
+    """The family as a random field whose standard deviation is 1 where its evidence to first order is largest.
+
+    Args:
+        problem: with the site.
+        name: of the effect.
+        suspect: the family.
+        positive: whether the site's values have to stay positive.
+    """
+    shape, parts, field_shape = (
+        _shape(problem, suspect),
+        _parts(suspect, problem),
+        _field_shape(problem, suspect),
+    )
+    step = _step(suspect, shape, parts)
+    rewrites: dict[str, Any] = {}
+    distributions: dict[str, Any] = {}
+    if suspect.rows is None:
+        rewrites[suspect.site] = lambda value, p, _: _moved(
+            value, step(p[_UNIT] * p[FIELD]), positive=positive
+        )
+    else:
+        distributions[suspect.site] = lambda fn, p, _: _redistributed(fn, suspect, step(p[_UNIT] * p[FIELD]))
+    family, _, instance = name.rstrip("]").partition("[")
+    return Effect(
+        family,
+        rewrites,
+        (Parameter(_UNIT, dist.HalfNormal(1.0)),),
+        instance=instance,
+        kind="variance",
+        distributions=distributions,
+        field_shape=lambda *_: field_shape,
+    )
+
+
+def _step(suspect: Suspect, shape: tuple[int, ...], parts: int) -> Callable[[Any], jax.Array]:
+    """Random weights -> what is added to the site."""
+    pattern, factor, spread = suspect.family.pattern, jnp.asarray(suspect.family.factor), suspect.spread
+    kept = tuple(n if i in pattern.kept else 1 for i, n in enumerate(shape))
+    curves = pattern.curves
+    groups = curves.tocsc().indices if isinstance(curves, sparse.csr_matrix) else None
+    dense = jnp.asarray(curves) if isinstance(curves, np.ndarray) else None
+
+    def step(weights: Any) -> jax.Array:
+        pair = spread * weights.reshape(-1, parts)
+        along = pair if curves is None else pair[groups] if dense is None else dense.T @ pair
+        along = along.reshape(*kept, parts)
+        return factor * (along[..., 0] if parts == 1 else along[..., 0] + 1j * along[..., 1])
+
+    return step
+
+
+def _moved(value: jax.Array, step: jax.Array, *, positive: bool) -> jax.Array:
+    """A site's value after a step; what is positive stays so."""
+    return value * jnp.exp(step / value) if positive else value + step
+
+
+def _redistributed(fn: Any, suspect: Suspect, step: jax.Array) -> Any:
+    """An observed distribution with moved location (in standard deviations) or spread (in whitened units)."""
+    observed = whiten.observation(fn, jnp.zeros(fn.batch_shape + fn.event_shape), suspect.site)
+    p = dict(observed.parameters)
+    match suspect.family.kind, observed.family:
+        case "spread", "ComplexNormal" | "ComplexStudentT":
+            p["variance"] = p["variance"] * jnp.exp(step)
+        case "spread", _:
+            p["scale"] = p["scale"] * jnp.exp(step / jnp.sqrt(2.0))
+        case _, "ComplexNormal" | "ComplexStudentT":
+            p["loc"] = p["loc"] + step * jnp.sqrt(p["variance"] / 2)
+        case _, "Normal" | "LogNormal" | "StudentT":
+            p["loc"] = p["loc"] + step * p["scale"]
+        case _, "BernoulliLogits":
+            p["logits"] = p["logits"] + step
+        case _, "Poisson":
+            p["rate"] = p["rate"] * jnp.exp(step / jnp.sqrt(p["rate"]))
+        case _:
+            return fn
+    new = whiten.distribution(whiten.Observation(observed.family, p))
+    return new.mask(p["mask"] > 0) if "mask" in p else new
