@@ -14,6 +14,7 @@ from dtprob.gap import closed
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.settings import Settings
+from dtprob.gap.where import SiteFinding
 from dtprob.inference.engine import AbstractEngine
 
 _DRAWS = 200
@@ -68,7 +69,7 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
         case "LISTED_WITH_REMAINDER":
             return f"Most of the gap comes from {name}{closed_part}; something that no known effect explains is left."
         case "UNLISTED":
-            sites = ", ".join(s.site for s in evidence.after.sites[:2] if s.p_value <= 0.01)
+            sites = ", ".join(_place(s) for s in evidence.after.sites[:2] if s.p_value <= 0.01)
             tail = f" It shows at {sites}." if sites else ""
             part = f" {name} imitates part of it." if name else ""
             return f"There is a gap, and none of the known effects explains it.{tail}{part}"
@@ -83,6 +84,11 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
             )
 
 
+def _place(found: SiteFinding) -> str:
+    """A site, or the spread of an observation, as text."""
+    return f"the spread of {found.site}" if found.family.startswith("spread") else found.site
+
+
 def _where(evidence: Evidence) -> dict[str, Any]:
     total = max(evidence.bracket[1] - float(evidence.held_before.log_likelihood.sum()), 1e-12)
     excess = sum(c.excess for c in evidence.before.coordinates) or 1.0
@@ -94,7 +100,7 @@ def _where(evidence: Evidence) -> dict[str, Any]:
     }
     return {
         "sites": [
-            {"site": s.site, "p_value": s.p_value, "share": shares[s.site]}
+            {"site": s.site, "p_value": s.p_value, "share": shares[s.site], "family": s.family}
             for s in sorted(evidence.before.sites, key=lambda s: (s.last, -shares[s.site], s.p_value))
         ],
         "coordinates": [

@@ -45,7 +45,10 @@ def gap_chart(report: Report) -> Chart | None:
     if floor is not None:
         told.append(f"Best possible: between {number(floor[0])} and {number(floor[1])}.")
     figure = gap_track(gap["before"], gap["after"], floor, unit=gap["unit"])
-    caption = "Shorter bars are better; the best possible ends somewhere in the lowest bar."
+    caption = (
+        "Shorter bars are better; the best possible ends somewhere in the lowest bar. With a loss of 0.1 nats per "
+        "observation more, a twin finds what was measured about 10% less likely at each observation."
+    )
     return Chart(
         inline_svg(figure, " ".join(told)), caption if floor is not None else "Further left is better."
     )
@@ -65,6 +68,22 @@ def closing_chart(report: Report) -> Chart | None:
     return Chart(
         inline_svg(figure, f"Share of the gap closed: {told}."),
         "How much of the gap each cause closes when it is added alone, with 90% intervals.",
+    )
+
+
+def remainder_chart(report: Report) -> Chart | None:
+    """What the model of the remainder closes, with its interval."""
+    remainder = report.get("remainder")
+    shares = _in_percent(remainder["closed_fraction"]) if remainder else None
+    if shares is None:
+        return None
+    row = IntervalRow("With what is left modelled at its site", *shares)
+    figure = interval_plot(
+        [row], label="Of what is left, closed on held-out data (%)", null=0.0, bounds=(0.0, 100.0)
+    )
+    told = f"Share of what is left that is closed: {row.mean:.0f}% ({row.low:.0f}% to {row.high:.0f}%)."
+    return Chart(
+        inline_svg(figure, told), "Dot: best estimate. Bar: 90% interval. Below 0: it makes things worse."
     )
 
 
@@ -184,4 +203,6 @@ def all_charts(report: Report, gap: xr.DataTree | None) -> Iterator[tuple[str, C
     if report["verdict"] == "NO_GAP":  # bars and colours would make noise look like a finding
         return
     yield from (("plan", chart) for chart in plan_charts(report, gap))
+    rest = remainder_chart(report)
+    yield from (("remainder", chart) for chart in (rest,) if chart is not None)
     yield from (("far", chart) for chart in (gap_chart(report), closing_chart(report)) if chart is not None)

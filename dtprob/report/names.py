@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from dtprob.report.advice import family
-from dtprob.report.json_schema import Cause, Coordinates, Detectable, Interval, Site, Size
+from dtprob.report.json_schema import Cause, Coordinates, Detectable, Interval, Remainder, Site, Size
 from dtprob.report.units import (
     Reading,
     decimals_between,
@@ -39,6 +39,9 @@ _SITES = {
     "rx_response": "receive antenna responses",
     "noiseless_channel": "channel as a whole",
     "noise_power": "noise level",
+    "channel": "measured channel",
+    "label_deviation": "size of the labels' errors",
+    "y": "labels",
 }
 
 LEVEL = 0.05
@@ -66,6 +69,12 @@ def site_words(site: str) -> str:
     return _SITES.get(site, words(site))
 
 
+def located_words(site: Site) -> str:
+    """What of a site must change: its values, or the spread of what is observed there."""
+    spread = site.get("family", "").startswith("spread")
+    return f"spread of the {site_words(site['site'])}" if spread else site_words(site["site"])
+
+
 def spoken(text: str, codes: Iterable[str]) -> str:
     """The text with code names (those with an underscore or an instance) replaced by words."""
     found = sorted((code for code in codes if "_" in code or "[" in code), key=len, reverse=True)
@@ -82,6 +91,31 @@ def listing(items: Iterable[str], last: str = "and") -> str:
 def together(effects: Iterable[str]) -> str:
     """A set of effects as words."""
     return listing(words(effect) for effect in effects)
+
+
+def allowance(remainder: Remainder) -> str:
+    """How a model of the remainder lets the twin vary: `it lets the deviation vary by segment`."""
+    said: list[str] = []
+    for term in remainder["terms"]:
+        kind, _, pattern = term["shape"].partition(", ")
+        subject = (
+            f"spread of the {site_words(term['site'])}" if kind == "spread" else site_words(term["site"])
+        )
+        said.append(f"the {subject} vary {_varying(pattern)}")
+    return f"it lets {listing(said)}"
+
+
+def _varying(pattern: str) -> str:
+    """How a site family varies, in words: `from link to link`, `as a ripple in time`, `smoothly in time`."""
+    first = pattern.partition(" ")[0]
+    if pattern == "common":
+        return "by one amount for all"
+    if first == "smooth":
+        return f"smoothly {words(pattern.removeprefix('smooth '))}"
+    if first in ("ripple", "by", "along", "over"):
+        return f"as a {words(pattern)}" if first == "ripple" else words(pattern)
+    axes = pattern.split(" x ")
+    return f"from {listing(words(axis) for axis in axes)} to {listing(words(axis) for axis in axes)}"
 
 
 def capital(text: str) -> str:

@@ -11,7 +11,7 @@ from dtprob.report import names, units
 from dtprob.report.charts import all_charts
 from dtprob.report.json_schema import Candidate, Interval, validate
 from dtprob.report.palette import DARK, LIGHT
-from dtprob.report.story import next_step, rivals, tell
+from dtprob.report.story import left_over, next_look, next_step, rivals, tell
 
 FIRST = 12
 
@@ -51,6 +51,8 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
             story=tell(checked),
             next_step=next_step(checked),
             rivals=rivals(checked),
+            left_over=left_over(checked),
+            next_look=next_look(checked),
             charts={section: [chart for name, chart in charts if name == section] for section, _ in charts},
             candidates=ranked(checked.get("screening", [])),
             detectable=names.detectable_families(checked["detectable"]),
@@ -104,6 +106,8 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     units.number,
     names.words,
     names.site_words,
+    names.located_words,
+    names.allowance,
     names.together,
     names.listing,
     names.capital,

@@ -5,16 +5,17 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from dtprob.report.advice import ADVICE, family
-from dtprob.report.json_schema import Cause, Detectable, Report
+from dtprob.report.json_schema import Cause, Detectable, Report, Site
 from dtprob.report.names import (
     aliases,
+    block,
     capital,
     detail,
     detectable_families,
     listing,
+    located_words,
     shares,
     significant,
-    site_words,
     size_reading,
     spoken,
     together,
@@ -68,6 +69,20 @@ def next_step(report: Report) -> str | None:
     many = f" {times} times" if times > 1 else ""
     again = "" if offered else " again"
     return f"Measure {place}{again}{many}: there the explanations differ most.{_saved(plan)}"
+
+
+def next_look(report: Report) -> str:
+    """Where to look for an unknown cause: the block of the data that shows it most, the quantity that must change."""
+    blocks, left = significant(report["where"]["coordinates"]), left_over(report)
+    where = (
+        f" at {block(max(blocks, key=lambda b: b['share'] or 0.0))}, where the gap shows most"
+        if blocks
+        else ""
+    )
+    what = f" Look for what could change the {located_words(left[0])} there." if left else ""
+    if not where and not what:
+        return "No measurement is proposed."
+    return f"No measurement tells unknown causes apart. Look again{where or ' at the data'}.{what}"
 
 
 def _saved(plan: Mapping[str, Any]) -> str:
@@ -227,10 +242,19 @@ def advice(effect: str) -> str:
 
 
 def _seat(report: Report) -> str:
-    """` (in the path delays)`, where the remainder or the gap was located."""
-    left = [site if isinstance(site, str) else site["site"] for site in report["unlisted"]["sites"]]
-    sites = left or [site["site"] for site in significant(report["where"]["sites"])[:1]]
-    return f" and lies in the {listing(site_words(site) for site in sites[:2])}" if sites else ""
+    """` and lies in the path delays`, where the remainder or the gap was located."""
+    left = left_over(report) or significant(report["where"]["sites"])[:1]
+    return f" and lies in the {listing(located_words(site) for site in left[:2])}" if left else ""
+
+
+def left_over(report: Report) -> list[Site]:
+    """The sites at which something is left."""
+    known = {site["site"]: site for site in report["where"]["sites"]}
+    found: list[Site] = []
+    for site in report["unlisted"]["sites"]:
+        given: Site = {"site": site, "p_value": None, "share": None} if isinstance(site, str) else site
+        found.append({**given, "family": known.get(given["site"], given).get("family", "")})
+    return found
 
 
 _COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}
