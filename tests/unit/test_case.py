@@ -29,6 +29,7 @@ merge_shapes = false
 [effects]
 use = ["timing_offset", "gain_offset"]
 exclude = ["gain_offset[tx_0]"]
+known = ["timing_offset"]
 [engine]
 name = "nuts"
 [engine.options]
@@ -58,6 +59,7 @@ def test_everything_is_read(tmp_path):
     assert (case.scene.refraction, case.scene.diffraction, case.scene.merge_shapes) == (True, False, False)
     assert case.effects.use == ("timing_offset", "gain_offset")
     assert case.effects.exclude == ("gain_offset[tx_0]",)
+    assert case.effects.known == ("timing_offset",)
     assert (case.engine.name, case.engine.options, case.seed.value) == ("nuts", {"draws": 100}, 7)
     assert case.user_code == ()
     assert pickle.loads(pickle.dumps(case)) == case

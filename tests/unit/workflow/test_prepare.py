@@ -12,6 +12,7 @@ from numpyro.infer.util import log_density
 
 from dtprob.case import load_case
 from dtprob.data import ChannelData, read, write
+from dtprob.effects.effect import effects_of
 from dtprob.errors import InputError
 from dtprob.raytracing import storage
 from dtprob.workflow import prepare
@@ -75,6 +76,26 @@ def test_effects_by_name_and_without_some(folder):
     change(folder, 'use = "all"', 'use = ["timing_offset", "gain_offset"]\nexclude = ["gain_offset"]')
     prepared = prepare(load_case(folder / "case.toml"), need="diagnosis")
     assert {effect.family for effect in prepared.effects} == {"timing_offset"}
+
+
+@pytest.mark.parametrize("need", ["fit", "diagnosis"])
+def test_known_effects_are_unknowns_of_the_model_and_no_candidates(folder, need):
+    change(folder, 'use = "all"', 'use = ["timing_offset", "gain_offset"]\nknown = ["timing_offset"]')
+    prepared = prepare(load_case(folder / "case.toml"), need=need)
+    assert [effect.name for effect in effects_of(prepared.model)] == ["timing_offset"]
+    assert "timing_offset" not in {effect.name for effect in prepared.effects}
+    trace = handlers.trace(handlers.seed(prepared.model, 0)).get_trace(**prepared.data)
+    assert trace["timing_offset.delay"]["type"] == "sample"
+
+
+@pytest.mark.parametrize(
+    ("name", "got"),
+    [("object_displacement", "one effect"), ("phase_error", "random field"), ("timing", "effect family")],
+)
+def test_what_cannot_be_known_is_refused(folder, name, got):
+    change(folder, 'use = "all"', f'use = "all"\nknown = ["{name}"]')
+    with pytest.raises(InputError, match=got):
+        prepare(load_case(folder / "case.toml"), need="fit")
 
 
 def test_options_and_phase_reach_the_model(folder):
