@@ -19,6 +19,10 @@ _FINEST: Final = 512
 _CROSSED: Final = 3
 """Half waves along each of two columns of what varies over both."""
 _MOST_PAIRS: Final = 6
+_LONGEST: Final = 24
+"""Period of the longest cycle that is looked for; longer ones show as ripples."""
+_TURNS: Final = 6
+"""Times that a cycle has to come round."""
 
 type Curve = np.ndarray | sparse.csr_matrix
 type Curves = dict[str, Curve]
@@ -44,6 +48,15 @@ def curves(problem: Problem, axis: str, size: int) -> Curves:
         products = crossed[0][:, None] * crossed[1][None]
         found[f"over {one} and {other}"] = products.reshape(-1, size)
     return found
+
+
+def cycles(size: int) -> dict[int, sparse.csr_matrix]:
+    """For each period, the phases (phase, size) of an axis at which something may repeat; none where it is short."""
+    place = np.arange(size)
+    return {
+        period: sparse.csr_matrix((np.ones(size), (place % period, place)))
+        for period in range(2, min(_LONGEST, size // _TURNS) + 1)
+    }
 
 
 def _ripples(name: str, place: np.ndarray) -> Curves:

@@ -1,7 +1,7 @@
 """Ways in which the values of a site may be wrong, made from the model's own trace and the data's columns.
 
 A perturbation is a factor (the same for all, the value itself, its conjugate, its neighbour) times a pattern: weights that
-are shared along some axes, that vary smoothly or as a ripple along one, with a column of the data, or by a column's groups.
+are shared along some axes, that vary smoothly, as a ripple or in a cycle along one, with a column, or by groups.
 """
 
 from __future__ import annotations
@@ -9,13 +9,19 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Final, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.gap.curves import Curve, Curves
+from dtprob.gap.curves import Curve, Curves, cycles
 from dtprob.gap.problem import Problem
+
+_ROWS: Final = 8
+"""Positions of a second axis from which rows may follow one another from cluster to cluster."""
+_COLUMNS: Final = 16
+"""Entries beside the rows up to which each is looked at."""
 
 type Along = Callable[[str, int], Curves]
 
@@ -27,7 +33,8 @@ class Pattern:
     Attributes:
         label: how it varies, in words.
         kept: axes of the site along which it varies.
-        curves: (weight, size of the one axis that is kept), or None for a weight of its own at every position.
+        curves: (weight, size of the first kept axes together), each position of the others having weights of its own;
+            None for a weight of its own at every position.
     """
 
     label: str
@@ -35,17 +42,18 @@ class Pattern:
     curves: Curve | None = None
 
     def scores(self, summed: np.ndarray) -> np.ndarray:
-        """Scores (n, weight x part) of the weights from those of the entries (n, *kept, part), other axes summed over."""
+        """Scores (n, weights) of the weights from those of the entries (n, *kept, part), other axes summed over."""
         if self.curves is None:
             return summed.reshape(len(summed), -1)
-        n, size, part = summed.shape
-        mixed = self.curves @ np.moveaxis(summed, 1, 0).reshape(size, n * part)
-        return np.moveaxis(mixed.reshape(-1, n, part), 0, 1).reshape(n, -1)
+        n, (_, size) = len(summed), _shape(self.curves)
+        mixed = self.curves @ np.moveaxis(summed.reshape(n, size, -1), 1, 0).reshape(size, -1)
+        return np.moveaxis(mixed.reshape(mixed.shape[0], n, -1), 0, 1).reshape(n, -1)
 
     def perturbation(self, weights: np.ndarray, shape: Sequence[int], parts: int) -> np.ndarray:
-        """The entries (*site, part) that weights (weight x part,) stand for; broadcasts to the site's shape."""
-        pair = weights.reshape(-1, parts)
-        along = pair if self.curves is None else self.curves.T @ pair
+        """The entries (*site, part) that weights stand for; broadcasts to the site's shape."""
+        along = (
+            weights if self.curves is None else self.curves.T @ weights.reshape(_shape(self.curves)[0], -1)
+        )
         return along.reshape(*(n if i in self.kept else 1 for i, n in enumerate(shape)), parts)
 
 
@@ -101,6 +109,11 @@ class Site:
         """Scores (n, *site, part) of a perturbation of every entry."""
         entry = self.gradients * self.kinds[kind]
         return np.stack([np.real(entry), np.imag(entry)], -1) if np.iscomplexobj(entry) else entry[..., None]
+
+
+def _shape(curve: Curve) -> tuple[int, int]:
+    weights, size = np.shape(cast("np.ndarray", curve))
+    return weights, size
 
 
 def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients: np.ndarray) -> Site:
@@ -176,6 +189,18 @@ def _patterns(along: Along, site: Site) -> Iterator[Pattern]:
     for i, axis in enumerate(site.axes):
         for label, curve in along(axis, site.value.shape[i]).items():
             yield Pattern(label, (i,), curve)
+    yield from _cycles(site)
+
+
+def _cycles(site: Site) -> Iterator[Pattern]:
+    """What repeats along an axis, or along the rows of all clusters in their order, entry by entry of the other axes."""
+    shape, kept = site.value.shape, tuple(range(site.value.ndim))
+    for i, axis in enumerate(site.axes):
+        for period, curve in cycles(shape[i]).items():
+            yield Pattern(f"every {period} along {axis}", (i,), curve)
+    if len(shape) > 1 and shape[1] >= _ROWS and np.prod(shape[2:]) <= _COLUMNS:
+        for period, curve in cycles(shape[0] * shape[1]).items():
+            yield Pattern(f"every {period} along {site.axes[0]} and {site.axes[1]}", kept, curve)
 
 
 def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:

@@ -23,8 +23,10 @@ _LARGEST_FIELD: Final = 256
 """Entries of a field per cluster up to which it is fitted entry by entry."""
 _LARGEST_TANGENTS: Final = 100_000_000
 """Numbers that the tangents of a field may take: 0.8 GB."""
-_PREFERRED: Final = 0.9
-"""Share of a random field's evidence at which an effect with parameters of its own is preferred."""
+_PREFERRED: Final = 0.97
+"""Share of a random field's gain at which an effect with parameters of its own is preferred."""
+_AS_GOOD: Final = 3.0
+"""Nats by which such an effect may fall behind in any case."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 
@@ -93,8 +95,8 @@ def tried(
 def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:
     """The refit with the largest evidence, if it outweighs the choice among all candidates and is no minor matter.
 
-    A random field can imitate nearly anything, so an effect with parameters of its own is preferred when it reaches a good
-    part of the evidence; what the field would add on top is left to the next step.
+    A random field can imitate nearly anything, so an effect with parameters of its own is preferred when it reaches nearly
+    its evidence; what the field would add on top is left to the next step.
     """
     if not trials:
         return None
@@ -102,7 +104,7 @@ def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], setti
     gain = {name: trial.log_evidence - fitted.log_evidence for name, trial in trials.items()}
     chosen = max(gain, key=lambda name: gain[name])
     plain = {name: value for name, value in gain.items() if kinds[name] == "mean"}
-    if plain and max(plain.values()) >= _PREFERRED * gain[chosen]:
+    if plain and max(plain.values()) >= min(_PREFERRED * gain[chosen], gain[chosen] - _AS_GOOD):
         chosen = max(plain, key=lambda name: plain[name])
     so_far = fitted.log_evidence - base.log_evidence
     needed = max(np.log(len(kinds)) + 3.0, settings.minor * so_far)
