@@ -239,3 +239,47 @@ def test_wrong_report_is_refused(report: dict[str, Any]) -> None:
     report["gap"]["before"] = float("nan")
     with pytest.raises(InputError, match=r"report\.gap\.before: expected a finite number, got nan"):
         render(report, None, title="x")
+
+
+def test_a_spread_is_called_a_spread(examples: dict[str, Any]) -> None:
+    report = examples["UNLISTED"]()
+    report["where"]["sites"] = [
+        {"site": "noiseless_channel", "p_value": 1e-9, "share": 0.9, "family": "additive, link"},
+        {"site": "channel", "p_value": 1e-9, "share": 0.9, "family": "spread, by link"},
+    ]
+    report["unlisted"]["sites"] = ["channel"]
+    text = Page(render(report, None, title="x")).text
+    assert "lies in the spread of the measured channel" in text
+    assert "Spread of the measured channel" in text
+    assert "Channel as a whole" in text
+    assert "Look for what could change the spread of the measured channel there." in text
+
+
+def test_the_remainder_is_told_with_its_calibration(examples: dict[str, Any]) -> None:
+    report = examples["UNLISTED"]()
+    text = Page(render(report, None, title="x")).text
+    assert "What is left, modelled where it shows" not in text
+    report["remainder"] = {
+        "terms": [
+            {"site": "arrival", "shape": shape, "weights": 4, "per_cluster": own, "evidence": 9.0}
+            for shape, own in [
+                ("additive, smooth in time", False),
+                ("relative, link", True),
+                ("additive, by run", True),
+            ]
+        ],
+        "closed_fraction": {"mean": 0.81, "low": 0.7, "high": 0.9},
+        "gain_nats": 30.0,
+        "before": {"coverage": 0.71, "error_ratio": 1.6},
+        "after": {"coverage": 0.9, "error_ratio": 1.01},
+    }
+    page = Page(render(report, None, title="x"))
+    assert "this closes 81% of what is wrong (90% interval 70 to 90%)" in page.text
+    assert "vary smoothly in time" in page.text
+    assert "vary from link to link" in page.text
+    assert "vary by run" in page.text
+    assert "widens the prediction" in page.text
+    assert re.search(r"inside their 90% interval 71% 90% 90%", page.text)
+    assert any("Share of what is left" in (svg["aria-label"] or "") for svg in page.all("svg"))
+    report["remainder"]["before"]["coverage"] = report["remainder"]["after"]["coverage"] = None
+    assert "inside their 90% interval" not in Page(render(report, None, title="x")).text
