@@ -15,11 +15,14 @@ from typing import Any, Final
 import numpy as np
 
 from dtprob.files import atomic_write
+from dtprob.physical.bench import Bench
 from dtprob.physical.campaign import Plan, Site, describe, make_site
 from dtprob.physical.case_files import write_case
+from dtprob.physical.cells import touched
 from dtprob.physical.choose import KINDS, LISTED, choose
 from dtprob.physical.draws import FAMILIES
 from dtprob.physical.impairment import Simulation, measure
+from dtprob.physical.information import projected
 from dtprob.physical.study import Order, Track
 
 CONVENTION: Final = (
@@ -69,6 +72,7 @@ def _case(plan: Plan, out: Path, order: Order, site: Site) -> dict[str, Any]:
         [one.record() for one in choice.effects],
         choice.excluded,
         alias={"name": choice.alias[0], "correlation": choice.alias[1]} if choice.alias else None,
+        cells=_cells(bench, simulation, sum(one.lambda_ for one in choice.effects)),
         gap_db=_gap_db(simulation, bench.base),
         noise_power=simulation.noise.mean_power(channel.shape),
         thermal_noise_power=bench.noise_power,
@@ -78,10 +82,21 @@ def _case(plan: Plan, out: Path, order: Order, site: Site) -> dict[str, Any]:
     )
 
 
+def _cells(bench: Bench, simulation: Simulation, lambda_: float) -> dict[str, list[int]]:
+    """What the effects touch: what they shift, once the twin is fitted, and where they change the power of the noise."""
+    shape = bench.base.mean.shape
+    shift = (simulation.mean - bench.base.mean).reshape(-1)
+    left = projected(shift, bench.tangents, bench.noise_power, bench.precision)
+    energy = (left[: shift.size] ** 2 + left[shift.size :] ** 2).reshape(shape) / bench.noise_power
+    louder = np.broadcast_to(np.log(simulation.noise.power / np.min(simulation.noise.power)), shape)
+    return touched(energy + louder**2, AXES, lambda_, ("link",))
+
+
 def _gap_db(simulation: Simulation, base: Simulation) -> float | None:
     """Error of the base's mean over the channel's power, dB; None without any."""
     error = np.sum(np.abs(simulation.mean - base.mean) ** 2)
     return float(10 * np.log10(error / np.sum(np.abs(simulation.mean) ** 2))) if error > 0 else None
 
 
+AXES: Final = ("link", "snapshot", "rx_antenna", "tx_antenna", "subcarrier")
 TRACK: Final = track(Plan())

@@ -128,20 +128,33 @@ def information(bench: Bench, law: Law) -> float:
         bench: the sound law and the twin's freedom.
         law: the one with a fault.
     """
-    entropy = float(np.linalg.slogdet(law.covariance)[1].sum())
+    entropy = _log_determinant(law.covariance)
     difference = law.mean - bench.law.mean
 
     def twice(logarithms: np.ndarray) -> float:
         covariance = bench.family(logarithms)
-        inverse = np.linalg.inv(covariance)
+        inverse = _inverse(covariance)
         left = _remaining(difference, bench.tangents, inverse)
         spread = np.einsum("bij,bji->", inverse, law.covariance)
         fit = np.einsum("bi,bij,bj->", left, inverse, left)
-        return float(np.linalg.slogdet(covariance)[1].sum() - entropy + spread + fit - difference.size)
+        return float(_log_determinant(covariance) - entropy + spread + fit - difference.size)
 
     near = [(value - _WIDEST, value + _WIDEST) for value in bench.start]
     found = optimize.minimize(twice, bench.start, method="L-BFGS-B", bounds=near)
     return max(0.0, min(float(found.fun), twice(bench.start)))
+
+
+def _inverse(covariance: Covariance) -> Covariance:
+    if covariance.strides[0] == 0:  # one matrix, the same in all blocks
+        return np.broadcast_to(np.linalg.inv(covariance[0]), covariance.shape)
+    return np.linalg.inv(covariance)
+
+
+def _log_determinant(covariance: Covariance) -> float:
+    """Sum over the blocks."""
+    if covariance.strides[0] == 0:
+        return len(covariance) * float(np.linalg.slogdet(covariance[0])[1])
+    return float(np.linalg.slogdet(covariance)[1].sum())
 
 
 def visible(bench: Bench, law: Law) -> Float[np.ndarray, " direction"]:

@@ -38,7 +38,14 @@ file = "labels.csv"
 def _campaign(rng: np.random.Generator, _: int, families: Sequence[str]) -> Setup:
     survey = make_survey(rng)
     drawn = Families(lambda rng, family: draw(rng, family, survey), families, FOREIGN)
-    return Setup(survey.bench, drawn, partial(_write, survey), {"deviation": survey.deviation})
+    return Setup(
+        survey.bench,
+        drawn,
+        partial(_write, survey),
+        ("sample",),
+        ("sample",),
+        {"deviation": survey.deviation},
+    )
 
 
 def _write(survey: Survey, folder: Path, measured: Vector, excluded: Sequence[str], seed: int) -> None:

@@ -6,6 +6,7 @@ A study is a folder: what a diagnosis may read lies in `cases/NNNN`; what is tru
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -168,7 +169,7 @@ class Track[C]:
 
     def _write_key(self, out: Path, count: int, seed: int) -> Path:
         """Gather the records of all cases."""
-        records = (out / "truth" / f"{index:04d}.json" for index in range(count))
+        records = [out / "truth" / f"{index:04d}.json" for index in range(count)]
         key = {
             "format": "dtprob.withheld",
             "version": 1,
@@ -176,10 +177,22 @@ class Track[C]:
             "seed": seed,
             "convention": self.convention,
             "plan": dict(self.plan),
-            "cases": [json.loads(record.read_text(encoding="utf-8")) for record in records],
+            "cases": [
+                {
+                    **json.loads(record.read_text(encoding="utf-8")),
+                    "sha256": _hashes(out / "cases" / record.stem),
+                }
+                for record in records
+            ],
         }
         write_text(out / "key.json", json.dumps(key, indent=1))
         return out / "key.json"
+
+
+def _hashes(folder: Path) -> dict[str, str]:
+    """SHA-256 of each file of a case, so that a key proves which cases it belongs to."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
+    return {str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest() for file in files}
 
 
 def _check_names(what: str, asked: Iterable[str], known: Sequence[str], noun: str) -> None:

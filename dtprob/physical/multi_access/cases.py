@@ -6,25 +6,27 @@ sound network's; probabilities of arrivals and receptions differ from site to si
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
 from dtprob.data.write import write
 from dtprob.errors import InputError
 from dtprob.files import write_text
+from dtprob.physical.cells import touched
 from dtprob.physical.information import size_for
-from dtprob.physical.multi_access.fault import Fault
+from dtprob.physical.multi_access.fault import Fault, Past
 from dtprob.physical.multi_access.faults import FAMILIES, FOREIGN, LISTED, draw
+from dtprob.physical.multi_access.likeness import likeness
 from dtprob.physical.multi_access.log import record
 from dtprob.physical.multi_access.network import Network, reception
 from dtprob.physical.study import Order, Track, case_end
 
-KINDS: Final = ("null", "listed", "unlisted", "pair")
+KINDS: Final = ("null", "listed", "unlisted", "pair", "triple", "alias")
 BEFORE, AFTER, WINDOW = 3000, 600, 10
 CONVENTION: Final = (
     "lambda is twice the divergence of the log's law from the sound network's, summed over slots, times"
@@ -45,6 +47,10 @@ reference = "before.csv"
 
 """
 _TRIES: Final = 60
+_POOL: Final = 8
+"""Faults among which an alias is looked for."""
+_APART: Final = 0.5
+"""Faults of one case look less alike than this."""
 _TOLERANCE: Final = 0.15
 
 
@@ -70,7 +76,7 @@ def _network(rng: np.random.Generator, _number: int, _families: Sequence[str]) -
 
 def _case(out: Path, order: Order, network: Network) -> dict[str, Any]:
     """Simulate and write one case."""
-    faults, excluded = _choose(order.rng, order.kind, network, order.lambda_, order.families)
+    faults, excluded, alias = _choose(order.rng, order.kind, network, order.lambda_, order.families)
     folder, draws = out / "cases" / order.name, (order.seed, order.index)
     folder.mkdir(parents=True, exist_ok=True)
     write(folder / "before.csv", record((*draws, 2), network, BEFORE).log)
@@ -78,29 +84,77 @@ def _case(out: Path, order: Order, network: Network) -> dict[str, Any]:
     write(folder / "after.csv", after.log)
     write_text(folder / "case.toml", _MODEL + case_end(excluded, order.index))
     about = {"arrival": network.arrival.tolist(), "reception": network.reception.tolist()}
-    return order.record([one.record() for one in faults], excluded, **about)
+    effects = [one.record() for one in faults]
+    return order.record(effects, excluded, alias, cells=_cells(network, faults), **about)
+
+
+def _cells(network: Network, faults: Sequence[_Active]) -> dict[str, list[int]]:
+    """The devices' clusters that faults of traffic touch, where these are no more than half of them."""
+    acks = any(one.fault.acks is not None for one in faults)
+    if acks or not faults:
+        return {}
+    sound = network.arrival[:, 0]
+    before = np.ones(network.devices, int)
+    change = sum(
+        abs(one.fault.arrivals(sound, Past(AFTER, 1.0, before, one.fault.start(one.size)), one.size) - sound)
+        for one in faults
+        if one.fault.arrivals is not None
+    )
+    return touched(np.asarray(change).sum(axis=1), ("cluster",), sum(one.lambda_ for one in faults))
+
+
+class _Choice(NamedTuple):
+    """The faults of a case, the families that it takes out of the library, and what looks much like the fault."""
+
+    faults: tuple[_Active, ...] = ()
+    excluded: tuple[str, ...] = ()
+    alias: Mapping[str, Any] | None = None
 
 
 def _choose(
     rng: np.random.Generator, kind: str, network: Network, target: float, families: Sequence[str]
-) -> tuple[tuple[_Active, ...], tuple[str, ...]]:
-    """The faults of a case, and the families that it takes out of the library."""
+) -> _Choice:
+    """What a case holds."""
     if kind == "null":
-        return (), ()
+        return _Choice()
     if kind == "unlisted" and rng.random() < 1 / 3:
-        return (_sized(rng, network, target, FOREIGN),), ()
+        return _Choice((_sized(rng, network, target, FOREIGN),))
+    if kind == "alias":
+        return _aliased(rng, network, target, families)
     one = _sized(rng, network, target, families)
     if kind == "unlisted":
-        return (one,), (one.fault.family,)
+        return _Choice((one,), (one.fault.family,))
     if kind == "listed":
-        return (one,), ()
+        return _Choice((one,))
+    found = [one]
     for _ in range(_TRIES):
         other = _sized(rng, network, target, families)
-        if (other.fault.arrivals is None) != (one.fault.arrivals is None):
-            return (one, other), ()
-    raise InputError(
-        "withheld case", "faults of traffic and of the channel", "one of them", "Name more families"
-    )
+        if all(_apart(network, other, before) for before in found) and (
+            len(found) > 1 or (other.fault.arrivals is None) != (one.fault.arrivals is None)
+        ):
+            found.append(other)
+        if len(found) == (2 if kind == "pair" else 3):
+            return _Choice(tuple(found))
+    raise InputError("withheld case", "faults that can be told apart", "fewer", "Name more families")
+
+
+def _apart(network: Network, one: _Active, other: _Active) -> bool:
+    alike = likeness(network, (one.fault, one.size), (other.fault, other.size))
+    return one.fault.family != other.fault.family and alike < _APART
+
+
+def _aliased(rng: np.random.Generator, network: Network, target: float, families: Sequence[str]) -> _Choice:
+    """Of several faults the one that looks most like another one of them, be it of the same family."""
+    pool: dict[str, _Active] = {}
+    for _ in range(_POOL):
+        one = _sized(rng, network, target, families)
+        pool.setdefault(one.fault.name, one)
+    held = {name: (one.fault, one.size) for name, one in pool.items()}
+    pairs = [(likeness(network, held[a], held[b]), a, b) for a in held for b in held if a != b]
+    if not pairs:
+        raise InputError("withheld case", "faults of two names", ", ".join(held), "Name more families")
+    similar, true, other = max(pairs)
+    return _Choice((pool[true],), alias={"name": other, "correlation": similar})
 
 
 def _sized(rng: np.random.Generator, network: Network, target: float, families: Sequence[str]) -> _Active:

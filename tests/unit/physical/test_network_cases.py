@@ -103,6 +103,6 @@ def test_cases(tmp_path):
 def test_wrong_requests(tmp_path):
     assert set(LISTED) | set(FOREIGN) == set(FAMILIES)
     with pytest.raises(InputError, match="kinds"):
-        TRACK.generate(tmp_path, 1, 0, kinds=("triple",))
+        TRACK.generate(tmp_path, 1, 0, kinds=("quadruple",))
     with pytest.raises(InputError, match="family of faults"):
         draw(np.random.default_rng(0), "weather", NETWORK)
