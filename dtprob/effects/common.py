@@ -86,10 +86,13 @@ def is_coherent(sites: Sites, data: Data) -> bool:
     return has_phase(sites) and data.get("phase", "coherent") == "coherent" and not own
 
 
-def reference_power(data: Data) -> float | None:
-    """Mean square of the measured channel, the unit of what depends on the level; None without data."""
+def reference_power(data: Data) -> Float[np.ndarray, " 1"] | None:
+    """Mean square of the measured channel, the unit of what depends on the level; None without data.
+
+    An array, since programs are compiled anew for another number but not for another array.
+    """
     channel = data.get("channel")
-    return None if channel is None else float(np.mean(np.abs(np.asarray(channel)) ** 2))
+    return None if channel is None else np.mean(np.abs(np.asarray(channel)) ** 2, keepdims=True).reshape(1)
 
 
 def phasor(phase: Float[Array, "*n"]) -> Complex[Array, "*n"]:

@@ -83,7 +83,7 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
     power, measured = reference_power(data), band(data)
     if power is None or not has_phase(sites):
         return []
-    level = float(np.sqrt(power))
+    level = np.sqrt(power)
     effects = [
         Effect(
             "crosstalk",

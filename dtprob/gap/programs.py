@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.effect import FIELD, Context, Effect
-from dtprob.gap.quick import quick_jit
+from dtprob.gap.quick import Hoisted
 from dtprob.models.declaration import Data, split_static
 
 TRIALS: Final = 16
@@ -29,26 +29,23 @@ class Programs:
         means = [e for e in effects if e.kind == "mean" and e.rewrites]
         fields = [e for e in effects if e.kind == "variance"]
 
-        @quick_jit
         def tangents(values: Mapping[str, jax.Array], arrays: Any) -> dict[str, dict[str, jax.Array]]:
             context = Context(eqx.combine(arrays, static), values)
             return {e.name: {s: _derivative(e, s, values[s], context) for s in e.rewrites} for e in means}
 
-        @quick_jit
         def energy(
             values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], arrays: Any
         ) -> dict[str, jax.Array]:
             context = Context(eqx.combine(arrays, static), values)
             return {e.name: _field_energy(e, values, gradients, context) for e in fields}
 
-        @quick_jit
         def trials(
             values: Mapping[str, jax.Array], sizes: Mapping[str, jax.Array], arrays: Any
         ) -> dict[str, dict[str, jax.Array]]:
             context = Context(eqx.combine(arrays, static), values)
             return {e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in means}
 
-        self._tangents, self._energy, self._trials = tangents, energy, trials
+        self._tangents, self._energy, self._trials = Hoisted(tangents), Hoisted(energy), Hoisted(trials)
         self._nulls = {e.name: np.asarray(null_vector(e)) for e in means}
 
     def site_tangents(self, values: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:

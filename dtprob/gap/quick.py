@@ -2,12 +2,47 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import partial
+from typing import Any, final
 
+import equinox as eqx
 import jax
+import numpy as np
 
 quick_jit = partial(
     jax.jit,
     compiler_options={"xla_backend_optimization_level": 0, "xla_llvm_disable_expensive_passes": True},
 )
 """`jax.jit` without the compiler's expensive passes."""
+
+
+@final
+class Hoisted:
+    """A function compiled by `quick_jit`, the arrays that it closes over among the program's arguments.
+
+    Otherwise they would be constants of the program, which then serves no other data of the same shapes, and which takes
+    longer to compile the larger they are.
+
+    Args:
+        function: of arrays, to arrays.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+        self._programs: dict[Any, tuple[Any, Callable[..., Any]]] = {}
+
+    def __call__(self, *arguments: Any) -> Any:
+        """The function's value; compiled once for each set of shapes."""
+        leaves, structure = jax.tree.flatten(arguments)
+        shapes = structure, tuple(map(jax.typeof, leaves))
+        if shapes not in self._programs:
+            self._programs[shapes] = self._program(arguments)
+        closed, run = self._programs[shapes]
+        return run(closed, *arguments)
+
+    def _program(self, arguments: tuple[Any, ...]) -> tuple[Any, Callable[..., Any]]:
+        """The arrays that the function closes over, and the program that takes them before its arguments."""
+        converted = eqx.filter_closure_convert(self._function, *arguments)
+        closed, rest = eqx.partition(converted, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
+        return closed, quick_jit(lambda closed, *given: eqx.combine(closed, rest)(*given))
