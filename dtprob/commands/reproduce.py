@@ -40,7 +40,7 @@ def run(figure: str, out: Path, *, runs: int | None, seed: int, resume: bool) ->
         if not resume:
             shutil.rmtree(parts, ignore_errors=True)
         progress = Progress(say, parts)
-        start = time.monotonic()
+        start = time.monotonic() - progress.spent()
         made = module.run(jax.random.key(seed), count, progress)
         command = f"dtprob reproduce {figure} --runs {count} --seed {seed}"
         files = write(made, out, seed=seed, command=command, seconds=time.monotonic() - start)

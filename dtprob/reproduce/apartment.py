@@ -1,107 +1,131 @@
 """Real measurements, known causes: wrong twins of the measured apartment, and whether a diagnosis says what is wrong.
 
-Each twin of `apartment_twins` is diagnosed on the same measurements. The honest twin has a gap too, so what counts is
+The honest twin has a gap too. It is diagnosed first, and what is found there is known from then on: part of every twin,
+fitted with its other unknowns. Then each twin of `apartment_twins` is diagnosed on the same measurements. What counts is
 the extra gap of a wrong one: its held-out loss less that of the honest twin on the same links, in nats. An answer is
 right where it names an effect that undoes what was spoilt; its size is the share of the extra gap that it closes.
+Where the answer is not right, the twin is diagnosed once more with nothing to name but what undoes it: what that wins
+back on the same links is what the data know of the cause.
 """
 
+import re
 import tempfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Final, NamedTuple
+from typing import Final
 
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int, PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from dtprob.case import load_case
 from dtprob.data.uwb_apartment import read_links
 from dtprob.gap.diagnose import diagnose
+from dtprob.gap.diagnosis import Diagnosis
 from dtprob.gap.settings import Settings
 from dtprob.raytracing.paths import PathSet
-from dtprob.reproduce.apartment_twins import LINKS, TWINS, Twin, write_case
+from dtprob.reproduce.apartment_answers import (
+    Answer,
+    gaps,
+    is_right,
+    line,
+    needs_cause,
+    read,
+    share,
+    stored,
+    summary,
+)
+from dtprob.reproduce.apartment_twins import LACKING, LINKS, TWINS, Twin, write_case
 from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
 from dtprob.reproduce.progress import Progress
-from dtprob.workflow.prepare import prepare
+from dtprob.workflow.prepare import Prepared, prepare
 
 RUNS: Final = 1
 SETTINGS: Final = Settings(
     replicates=100, site_replicates=19, candidates=6, polished=0, max_effects=1, folds=3, grid=24, starts=1
 )
 """Of every diagnosis: one effect, no freeing from local optima."""
-_DRAWS: Final = 2000
 _SAME_PLACE: Final = 1e-3
-
-
-class Answer(NamedTuple):
-    """A diagnosis, in arrays.
-
-    Attributes:
-        link: numbers of the links that the twin reaches.
-        before: nats of each link left out, of the twin as it is.
-        after: the same with the effect that was named, or `before` where none was.
-        verdict: of the report.
-        named: the effect, or "".
-        inside: effects that the data cannot tell from it, itself included.
-        seconds: of processor time.
-    """
-
-    link: Int[np.ndarray, " link"]
-    before: Float[np.ndarray, " link"]
-    after: Float[np.ndarray, " link"]
-    verdict: str
-    named: str
-    inside: tuple[str, ...]
-    seconds: float
+_PLACE: Final = re.compile(r"(\w+)\[(transmitter|receiver)_(\d+)\]")
+"""An effect of one end's place."""
 
 
 def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
     """The figure; see the module. A run is another split of the links and other replicates."""
+    found = progress.part(
+        "what the honest twin lacks", lambda: {"known": np.array(lacking(key, progress.say), str)}
+    )
+    known = tuple(map(str, found["known"]))
 
-    def one(twin: Twin, number: int) -> Answer:
+    def one(twin: Twin, number: int, offered: Sequence[str] | None = None) -> Answer:
         own = jax.random.fold_in(key, number)
-        part = progress.part(
-            f"twin {twin.name}, run {number}", lambda: _stored(answer(twin, own, progress.say))
-        )
-        return _read(part)
+        name = f"{'twin' if offered is None else 'cause of twin'} {twin.name}, run {number}"
+        part = progress.part(name, lambda: stored(answer(twin, own, known, offered, say=progress.say)))
+        return read(part)
 
     answers = [{twin.name: one(twin, number) for twin in TWINS} for number in range(runs)]
     wrong = TWINS[1:]
+    causes = [
+        {t.name: one(t, number, t.undone_by) for t in wrong if needs_cause(t, a)}
+        for number, a in enumerate(answers)
+    ]
     extra = np.array([[gaps(a, twin.name)[0].sum() for twin in wrong] for a in answers])
-    closed = np.array([[_share(*gaps(a, twin.name)) for twin in wrong] for a in answers])
+    closed = np.array([[share(*gaps(a, twin.name)) for twin in wrong] for a in answers])
+    undone = np.array(
+        [[share(*gaps({**a, **c}, t.name)) for t in wrong] for a, c in zip(answers, causes, strict=True)]
+    )
     x = np.arange(1.0, len(wrong) + 1)
     axis = Quantity("wrong twin, as numbered in the notes")
     panels = (
         Panel("extra gap", axis, Quantity("extra loss", "nats"), (Series.of_runs("extra", x, extra),)),
-        Panel("closed", axis, Quantity("share of the extra gap"), (Series.of_runs("closed", x, closed),)),
+        Panel(
+            "closed",
+            axis,
+            Quantity("share of the extra gap"),
+            (Series.of_runs("closed", x, closed), Series.of_runs("closed by the cause alone", x, undone)),
+        ),
     )
-    notes = [_line(i, twin, answers) for i, twin in enumerate(TWINS)]
-    return Figure(
-        "apartment", "Wrong twins of a measured apartment", panels, runs, (*notes, _summary(answers))
-    )
+    notes = [line(i, twin, answers, causes) for i, twin in enumerate(TWINS)]
+    first = f"known of every twin, since the honest one lacks it: {', '.join(known) or 'nothing'}"
+    title = "Wrong twins of a measured apartment"
+    return Figure("apartment", title, panels, runs, (first, *notes, summary(answers)))
 
 
-def answer(twin: Twin, key: Array, say: Callable[[str], None] = lambda _: None) -> Answer:
+def lacking(key: Array, say: Callable[[str], None] = lambda _: None) -> tuple[str, ...]:
+    """What the diagnosis of the honest twin finds.
+
+    Args:
+        key: typed JAX key.
+        say: receives one line at each stage.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        prepared = _prepared(TWINS[0], Path(folder), (), LACKING, say)
+        found = _diagnosed(prepared, key, SETTINGS, say)
+    return found.causes[0].effects if found.causes else ()
+
+
+def answer(
+    twin: Twin,
+    key: Array,
+    known: Sequence[str] = (),
+    offered: Sequence[str] | None = None,
+    *,
+    say: Callable[[str], None] = lambda _: None,
+) -> Answer:
     """Diagnose a twin.
 
     Args:
         twin: which.
         key: typed JAX key.
+        known: what the honest twin lacks, by the names that effects have there; but what undoes the twin is no part of it.
+        offered: the candidates; by default those of every twin.
         say: receives one line at each stage.
     """
     start = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        prepared = prepare(load_case(write_case(twin, Path(folder))), need="diagnosis", say=say)
-        found = diagnose(
-            prepared.model,
-            prepared.data,
-            prepared.effects,
-            key=key,
-            engine=prepared.engine,
-            settings=SETTINGS,
-            say=say,
-        )
+        prepared = _prepared(twin, Path(folder), known, offered, say)
+        found = _diagnosed(prepared, key, SETTINGS, say)
         reached = _numbers(prepared.case.data.file, prepared.data["paths"])
     links = found.maps["links"]
     per_link = prepared.data["channel"][0].size
@@ -113,23 +137,62 @@ def answer(twin: Twin, key: Array, say: Callable[[str], None] = lambda _: None) 
     return Answer(reached, before, after, found.verdict, named, inside, time.process_time() - start)
 
 
-def gaps(
-    answers: Mapping[str, Answer], name: str
-) -> tuple[Float[np.ndarray, " link"], Float[np.ndarray, " link"]]:
-    """What a twin loses against the honest one, and what its answer wins back, nats of each link that both reach.
+def _prepared(
+    twin: Twin,
+    folder: Path,
+    known: Sequence[str],
+    offered: Sequence[str] | None,
+    say: Callable[[str], None],
+) -> Prepared:
+    """A twin's case, traced once: which links it reaches decides how what is known is called there."""
+    if known:
+        traced = prepare(load_case(write_case(twin, folder)), need="fit", cache=folder, say=say)
+        reached = _numbers(traced.case.data.file, traced.data["paths"])
+        known = renumbered(
+            [name for name in known if not is_right(twin, [name])], traced.case.data.file, reached
+        )
+    case = load_case(write_case(twin, folder, known, offered))
+    return prepare(case, need="diagnosis", cache=folder, say=say)
+
+
+def _diagnosed(prepared: Prepared, key: Array, settings: Settings, say: Callable[[str], None]) -> Diagnosis:
+    return diagnose(
+        prepared.model,
+        prepared.data,
+        prepared.effects,
+        key=key,
+        engine=prepared.engine,
+        settings=settings,
+        say=say,
+    )
+
+
+def renumbered(names: Sequence[str], folder: Path, reached: Int[np.ndarray, " link"]) -> tuple[str, ...]:
+    """Effects of one place by the number that it has among the ends of the links that a twin reaches.
 
     Args:
-        answers: of all twins.
-        name: of the twin.
+        names: of effects, places counted over all links.
+        folder: of the twin's measured set.
+        reached: numbers of the links.
+
+    Returns:
+        The names; without those of places that no link is left of.
     """
-    honest, wrong = answers[TWINS[0].name], answers[name]
-    _, first, second = np.intersect1d(honest.link, wrong.link, return_indices=True)
-    return wrong.before[second] - honest.before[first], wrong.before[second] - wrong.after[second]
-
-
-def is_right(twin: Twin, names: Sequence[str]) -> bool:
-    """Whether one of these effects undoes what is wrong with a twin."""
-    return any(name in twin.undone_by or name.partition("[")[0] in twin.undone_by for name in names)
+    links = {link.number: link for link in read_links(folder)}
+    result: list[str] = []
+    for name in names:
+        parts = _PLACE.fullmatch(name)
+        if parts is None:
+            result.append(name)
+            continue
+        family, kind, number = parts.groups()
+        end = "anchor" if kind == "transmitter" else "tag"
+        before, after = (
+            np.unique([getattr(links[n], end) for n in numbers], axis=0) for numbers in (LINKS, reached)
+        )
+        same = np.flatnonzero(np.abs(after - before[int(number)]).max(axis=1) < _SAME_PLACE)
+        result += [f"{family}[{kind}_{same[0]}]"] if len(same) else []
+    return tuple(result)
 
 
 def _numbers(folder: Path, paths: PathSet) -> Int[np.ndarray, " link"]:
@@ -139,68 +202,3 @@ def _numbers(folder: Path, paths: PathSet) -> Int[np.ndarray, " link"]:
     return np.array(
         [n for n in LINKS if np.any(np.abs(reached[:, [0, 1, 3, 4]] - known[n]).max(axis=1) < _SAME_PLACE)]
     )
-
-
-def _stored(found: Answer) -> dict[str, np.ndarray]:
-    return {name: np.asarray(value) for name, value in found._asdict().items()}
-
-
-def _read(part: Mapping[str, np.ndarray]) -> Answer:
-    return Answer(
-        link=part["link"],
-        before=part["before"],
-        after=part["after"],
-        verdict=str(part["verdict"]),
-        named=str(part["named"]),
-        inside=tuple(map(str, part["inside"])),
-        seconds=float(part["seconds"]),
-    )
-
-
-def _total(extra: Float[np.ndarray, " link"]) -> tuple[float, float, float]:
-    """Sum over links with its 90% interval by a bootstrap over links."""
-    index = np.random.default_rng(0).integers(0, len(extra), (_DRAWS, len(extra)))
-    low, high = np.quantile(extra[index].sum(axis=1), [0.05, 0.95])
-    return float(extra.sum()), float(low), float(high)
-
-
-def _share(extra: Float[np.ndarray, " link"], won: Float[np.ndarray, " link"]) -> float:
-    """Share of the extra gap that is won back; nan where the extra gap is not established."""
-    total, low, _ = _total(extra)
-    return float(won.sum()) / total if low > 0 else float("nan")
-
-
-def _line(number: int, twin: Twin, answers: Sequence[Mapping[str, Answer]]) -> str:
-    """What one twin brought, over runs."""
-    found = [a[twin.name] for a in answers]
-    named = ", ".join(dict.fromkeys(f.named or "nothing" for f in found))
-    gap = ""
-    if number:
-        total, low, high = _total(np.mean([gaps(a, twin.name)[0] for a in answers], axis=0))
-        share = np.mean([_share(*gaps(a, twin.name)) for a in answers])
-        closed = "not established" if np.isnan(share) else f"{share:.2f} of it closed"
-        gap = f"extra gap {total:.1f} nats ({low:.1f} to {high:.1f}), {closed}; "
-    right = ""
-    if twin.undone_by:
-        first = np.mean([is_right(twin, [f.named]) for f in found])
-        inside = np.mean([is_right(twin, f.inside) for f in found])
-        right = f"; right first {first:.2f}, inside the class {inside:.2f}"
-    verdicts = ", ".join(dict.fromkeys(f.verdict for f in found))
-    seconds = np.mean([f.seconds for f in found])
-    return (
-        f"{number} {twin.name} ({twin.wrong}): {gap}{verdicts}, named {named}{right};"
-        f" {len(found[0].link)} links, {seconds:.0f} s of processor time"
-    )
-
-
-def _summary(answers: Sequence[Mapping[str, Answer]]) -> str:
-    """How often the answer is right: of all twins that an effect undoes, and of those with an extra gap."""
-    able = [(twin, a) for a in answers for twin in TWINS if twin.undone_by]
-    seen = [(twin, a) for twin, a in able if _total(gaps(a, twin.name)[0])[1] > 0]
-
-    def right(cases: Sequence[tuple[Twin, Mapping[str, Answer]]]) -> str:
-        first = sum(is_right(twin, [a[twin.name].named]) for twin, a in cases)
-        inside = sum(is_right(twin, a[twin.name].inside) for twin, a in cases)
-        return f"right first in {first} of {len(cases)}, inside the class in {inside}"
-
-    return f"{right(able)}; of those whose extra gap is established {right(seen)}"

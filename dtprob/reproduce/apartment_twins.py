@@ -7,7 +7,8 @@ else: the floor plan, the table of links, the radio. `dtprob diagnose` reads it 
 import csv
 import json
 import shutil
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from itertools import combinations
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -91,23 +92,40 @@ TWINS: Final = (
 )
 """The honest twin first."""
 
+_SWAPS: Final = tuple(
+    f"swapped_transmitters[{a}_{b}]" for half in (range(4), range(4, 8)) for a, b in combinations(half, 2)
+)
+"""Of the anchors of one half of the flat: no tag was measured from both halves."""
+
 EFFECTS: Final = (
-    *("transmitter_displacement", "receiver_displacement", "scene_scale", "swapped_transmitters"),
+    *("transmitter_displacement", "receiver_displacement", "scene_scale"),
     *("carrier_mismatch", "bandwidth_mismatch", "missing_object", "missing_path[line_of_sight]"),
     *("missing_path[reflection]", "polarization_mismatch", "wall_law", "depth_cut_off"),
 )
-"""Candidates of every twin; refraction_off only where the twin lets nothing through walls."""
+"""Candidates of every twin. Those that need other traces join them where something of the kind is wrong: refraction_off
+where the twin lets nothing through walls, all exchanges of anchors within a half of the flat where two were exchanged."""
+
+LACKING: Final = (
+    *("transmitter_displacement", "receiver_displacement", "scene_scale", "polarization_mismatch"),
+    *("missing_path[line_of_sight]", "missing_path[reflection]", "wall_law", "depth_cut_off"),
+)
+"""What the honest twin may be found to lack: things that have the same name in every twin. The campaign's own notes, of
+whose place is whose, the carrier and the bandwidth, are believed there."""
 
 LEFT_OUT: Final = ("receiver_displacement[each_link]", "transmitter_displacement[each_link]")
 """Random fields that imitate any error of the geometry: the honest twin calls for the first."""
 
 
-def write_case(twin: Twin, folder: Path) -> Path:
+def write_case(
+    twin: Twin, folder: Path, known: Sequence[str] = (), offered: Sequence[str] | None = None
+) -> Path:
     """Write a twin's CASE and its copy of the measured set; the name of the CASE.
 
     Args:
         twin: what is wrong with it.
         folder: receives case.toml and the folder of the set.
+        known: effects that are made part of the twin.
+        offered: the candidates; by default those of every twin.
 
     Raises:
         InputError: the measured set is not there.
@@ -118,7 +136,7 @@ def write_case(twin: Twin, folder: Path) -> Path:
     write_text(target / "links.csv", _links(source / "links.csv", twin))
     write_text(target / "floorplan.json", _plan(source / "floorplan.json", twin))
     write_text(target / "radio.json", _radio(source / "radio.json", twin))
-    write_text(folder / "case.toml", _case(twin))
+    write_text(folder / "case.toml", _case(twin, known, offered))
     return folder / "case.toml"
 
 
@@ -145,7 +163,7 @@ def _radio(source: Path, twin: Twin) -> str:
     return json.dumps(radio, indent=1)
 
 
-def _case(twin: Twin) -> str:
+def _case(twin: Twin, known: Sequence[str], offered: Sequence[str] | None) -> str:
     scene = {
         "file": f"{NAME}/floorplan.json",
         "frequency": CARRIER,
@@ -155,22 +173,25 @@ def _case(twin: Twin) -> str:
         "skip_unreached": True,
         "device_height": 1.2,
         "ceiling_height": 2.6,
-        "wall_material": "brick",
-        "wall_thickness": 0.12,
+        "wall_material": "concrete",
+        "wall_thickness": 0.05,
         "samples": 100_000,
         "strongest": 6,
         "check_depth": 3,
-        "check_transmitters": True,
         **twin.scene,
     }
-    use = [*EFFECTS, *(["refraction_off"] if not scene["refraction"] else [])]
+    if offered is None:
+        swapped = any(name in _SWAPS for name in twin.undone_by)
+        opaque = not scene["refraction"]
+        offered = (*EFFECTS, *(["refraction_off"] if opaque else []), *(_SWAPS if swapped else []))
+    scene["check_transmitters"] = any(name in _SWAPS for name in offered)
     sections: dict[str, Mapping[str, Any]] = {
         "model": {"name": "ultra_wideband_channel"},
         "model.options": {"time_origin": "ranged", "model_error": 0.5},
         "data": {"file": NAME, "phase": "per_packet"},
         "data.options": {"averages": 2, "level": "reported", "links": list(LINKS)},
         "scene": scene,
-        "effects": {"use": use, "exclude": list(LEFT_OUT)},
+        "effects": {"use": list(offered), "exclude": list(LEFT_OUT), "known": list(known)},
     }
     lines = [f"# A twin of the measured apartment; wrong: {twin.wrong}."]
     for name, content in sections.items():

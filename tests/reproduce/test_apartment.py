@@ -14,7 +14,8 @@ from dtprob.effects import FAMILIES
 from dtprob.errors import InputError
 from dtprob.raytracing.floorplan import read_floorplan
 from dtprob.reproduce import apartment
-from dtprob.reproduce.apartment import Answer, gaps, is_right
+from dtprob.reproduce.apartment import renumbered
+from dtprob.reproduce.apartment_answers import Answer, gaps, is_right
 from dtprob.reproduce.apartment_twins import LINKS, TWINS, Twin, write_case
 from dtprob.reproduce.progress import Progress
 
@@ -48,32 +49,56 @@ def test_an_answer_is_right_by_family_or_by_instance():
     assert not is_right(BY_NAME["plaster"], ["missing_path[reflection]"])
 
 
-def test_the_figure_counts_what_is_right(monkeypatch):
-    rng = np.random.default_rng(0)
-    base = rng.normal(size=21)
+def made(monkeypatch, named_by, lost_by, known=("depth_cut_off", "receiver_displacement[receiver_2]")):
+    """The figure of made-up answers: what each twin loses in nats of a link, and what is named in it."""
+    base, asked = np.random.default_rng(0).normal(size=len(LINKS)), []
 
-    def diagnosed(twin, key, say):
+    def diagnosed(twin, key, given, offered=None, *, say):
         del key, say
-        lost = 5.0 if twin.name in {"swap_2_4", "depth"} else 0.0
-        named = "swapped_transmitters[4_5]" if twin.name == "swap_2_4" else ""
-        before = base + lost
-        return answer(before, before - 4.0 if named else None, LINKS, named, (named,) if named else ())
+        asked.append((twin.name, tuple(given), offered))
+        lost = lost_by.get(twin.name, 0.0)
+        named = named_by.get(twin.name, "") if offered is None else offered[0]
+        won = (4.0 if offered is None else 1.0) if named else 0.0
+        return answer(base + lost, base + lost - won, LINKS, named, (named,) if named else ())
 
+    monkeypatch.setattr(apartment, "lacking", lambda key, say: known)
     monkeypatch.setattr(apartment, "answer", diagnosed)
-    made = apartment.run(apartment.jax.random.key(0), 1, Progress())
+    return apartment.run(apartment.jax.random.key(0), 1, Progress()), asked
+
+
+def test_the_figure_counts_what_is_right(monkeypatch):
+    named = {"swap_2_4": "swapped_transmitters[4_5]"}
+    figure, _ = made(monkeypatch, named, {"swap_2_4": 5.0, "depth": 5.0})
     wrong = [twin.name for twin in TWINS[1:]]
-    closed = dict(zip(wrong, made.panels[1].series[0].median, strict=True))
+    closed = dict(zip(wrong, figure.panels[1].series[0].median, strict=True))
     assert np.isclose(closed["swap_2_4"], 0.8)
     assert closed["depth"] == 0.0
     assert np.isnan(closed["carrier"])
     able = sum(bool(twin.undone_by) for twin in TWINS)
-    assert made.notes[-1] == (
+    assert figure.notes[-1] == (
         f"right first in 1 of {able}, inside the class in 1; of those whose extra gap is established right first in 1 of 2,"
         " inside the class in 1"
     )
     assert "extra gap 105.0 nats (105.0 to 105.0), 0.80 of it closed" in next(
-        note for note in made.notes if "swap_2_4" in note
+        note for note in figure.notes if "swap_2_4" in note
     )
+
+
+def test_what_the_honest_twin_lacks_is_known_to_all_and_missed_causes_get_a_second_try(monkeypatch):
+    named = {"swap_2_4": "swapped_transmitters[4_5]", "anchor_3": "scene_scale", "carrier": "scene_scale"}
+    figure, asked = made(monkeypatch, named, {"swap_2_4": 5.0, "anchor_3": 5.0})
+    assert {given for _, given, _ in asked} == {("depth_cut_off", "receiver_displacement[receiver_2]")}
+    assert [name for name, _, offered in asked if offered is None] == [twin.name for twin in TWINS]
+    assert [(name, offered) for name, _, offered in asked if offered is not None] == [
+        ("anchor_3", BY_NAME["anchor_3"].undone_by)  # the carrier's gap is not established
+    ]
+    assert "depth_cut_off, receiver_displacement[receiver_2]" in figure.notes[0]
+    assert "of its cause alone transmitter_displacement[transmitter_7] is accepted and closes 0.20" in next(
+        note for note in figure.notes if "anchor_3" in note
+    )
+    alone = dict(zip([twin.name for twin in TWINS[1:]], figure.panels[1].series[1].median, strict=True))
+    assert np.isclose(alone["anchor_3"], 0.2)
+    assert np.isclose(alone["swap_2_4"], 0.8)
 
 
 @pytest.fixture(scope="module")
@@ -110,6 +135,17 @@ def test_only_what_is_named_is_spoilt(measured, tmp_path, twin: Twin):
     radio, before = read_radio(copy), read_radio(measured)
     assert np.isclose(radio.bandwidth, twin.bandwidth * before.bandwidth)
     assert np.isclose(radio.tap * radio.bandwidth, before.tap * before.bandwidth)
+
+
+@pytest.mark.measured
+def test_places_are_counted_over_the_links_that_are_reached(measured):
+    links = {link.number: link for link in read_links(measured)}
+    tags = np.unique([links[n].tag for n in LINKS], axis=0)
+    gone = [n for n in LINKS if tuple(links[n].tag) == tuple(tags[3])]
+    left = np.array([n for n in LINKS if n not in gone])
+    names = ["depth_cut_off", *(f"receiver_displacement[receiver_{k}]" for k in (2, 3, 4))]
+    assert renumbered(names, measured, np.array(LINKS)) == tuple(names)
+    assert renumbered(names, measured, left) == tuple(names[:3])  # the fourth is the third then
 
 
 @pytest.mark.measured
