@@ -13,11 +13,14 @@ import xarray as xr
 from dtprob.gap import closed
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
+from dtprob.gap.screen import Screening
 from dtprob.gap.settings import Settings
 from dtprob.gap.where import SiteFinding
 from dtprob.inference.engine import AbstractEngine
 
 _DRAWS = 200
+_MOST_ALIKE = 300
+"""Candidates up to which a report tells how much each looks like each."""
 
 
 def compose(
@@ -46,7 +49,12 @@ def compose(
         ],
         "screening": _screening(evidence),
         "fit": _fit(evidence, jax.random.fold_in(key, 3)),
-        "provenance": {"engine": engine.name, "seed": _seed(key), "model": evidence.problem.declaration.name},
+        "provenance": {
+            "engine": engine.name,
+            "seed": _seed(key),
+            "model": evidence.problem.declaration.name,
+            **_alike(first),
+        },
     }
     return Diagnosis(verdict, summary(verdict, causes, evidence), causes, sections, _maps(evidence))
 
@@ -167,6 +175,14 @@ def _screening(evidence: Evidence) -> list[dict[str, Any]]:
         }
         for i in map(int, order)
     ]
+
+
+def _alike(first: Screening) -> dict[str, Any]:
+    """How much candidates look alike, for those who judge what could be told apart: rows below the diagonal."""
+    if len(first.names) > _MOST_ALIKE:
+        return {}
+    rows = [np.round(100 * row[:k]).astype(int).tolist() for k, row in enumerate(first.correlation)]
+    return {"alike": {"effects": list(first.names), "percent": rows}}
 
 
 def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:

@@ -234,7 +234,7 @@ def _detectable(scores: Scores, effect: Effect, settings: Settings) -> float:
 
 
 def _correlation(candidates: list[Effect], scores: Scores) -> np.ndarray:
-    """Largest canonical correlation between the candidates' scores; zero where one has no information."""
+    """Correlation of the candidates' scores, of several parameters the largest canonical one; zero without information."""
     result = np.eye(len(candidates))
     roots: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     for k, (effect, group) in enumerate(zip(scores.effects, scores.groups, strict=True)):
@@ -245,6 +245,8 @@ def _correlation(candidates: list[Effect], scores: Scores) -> np.ndarray:
         for b, right in enumerate(candidates[:a]):
             if left.name in roots and right.name in roots:
                 (g, u), (h, v) = roots[left.name], roots[right.name]
-                singular = np.linalg.svd(u.T @ scores.information[np.ix_(g, h)] @ v, compute_uv=False)
-                result[a, b] = result[b, a] = min(float(singular[0]), 1.0)
+                shared = u.T @ scores.information[np.ix_(g, h)] @ v
+                single = shared.size == 1
+                value = float(shared[0, 0]) if single else float(np.linalg.svd(shared, compute_uv=False)[0])
+                result[a, b] = result[b, a] = float(np.clip(value, -1.0, 1.0))
     return result
