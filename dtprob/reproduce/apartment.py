@@ -12,6 +12,7 @@ import re
 import tempfile
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Final
 
@@ -58,16 +59,16 @@ def run(key: PRNGKeyArray, runs: int, progress: Progress) -> Figure:
     )
     known = tuple(map(str, found["known"]))
 
-    def one(twin: Twin, number: int, offered: Sequence[str] | None = None) -> Answer:
+    def one(twin: Twin, number: int, *, alone: bool = False) -> Answer:
         own = jax.random.fold_in(key, number)
-        name = f"{'twin' if offered is None else 'cause of twin'} {twin.name}, run {number}"
-        part = progress.part(name, lambda: stored(answer(twin, own, known, offered, say=progress.say)))
+        name = f"{'cause of twin' if alone else 'twin'} {twin.name}, run {number}"
+        part = progress.part(name, lambda: stored(answer(twin, own, known, alone=alone, say=progress.say)))
         return read(part)
 
     answers = [{twin.name: one(twin, number) for twin in TWINS} for number in range(runs)]
     wrong = TWINS[1:]
     causes = [
-        {t.name: one(t, number, t.undone_by) for t in wrong if needs_cause(t, a)}
+        {t.name: one(t, number, alone=True) for t in wrong if needs_cause(t, a)}
         for number, a in enumerate(answers)
     ]
     extra = np.array([[gaps(a, twin.name)[0].sum() for twin in wrong] for a in answers])
@@ -109,8 +110,8 @@ def answer(
     twin: Twin,
     key: Array,
     known: Sequence[str] = (),
-    offered: Sequence[str] | None = None,
     *,
+    alone: bool = False,
     say: Callable[[str], None] = lambda _: None,
 ) -> Answer:
     """Diagnose a twin.
@@ -119,12 +120,15 @@ def answer(
         twin: which.
         key: typed JAX key.
         known: what the honest twin lacks, by the names that effects have there; but what undoes the twin is no part of it.
-        offered: the candidates; by default those of every twin.
+        alone: whether the only candidates are what undoes the twin.
         say: receives one line at each stage.
     """
     start = time.process_time()
     with tempfile.TemporaryDirectory() as folder:
-        prepared = _prepared(twin, Path(folder), known, offered, say)
+        prepared = _prepared(twin, Path(folder), known, twin.undone_by if alone else None, say)
+        if alone:
+            kept = tuple(effect for effect in prepared.effects if is_right(twin, [effect.name]))
+            prepared = replace(prepared, effects=kept)
         found = _diagnosed(prepared, key, SETTINGS, say)
         reached = _numbers(prepared.case.data.file, prepared.data["paths"])
     links = found.maps["links"]

@@ -1,5 +1,6 @@
 """What diagnoses of wrong twins answered, and how they are judged: by name, and by the extra gap that they close."""
 
+import re
 from collections.abc import Mapping, Sequence
 from typing import Final, NamedTuple
 
@@ -9,6 +10,9 @@ from jaxtyping import Float, Int
 from dtprob.reproduce.apartment_twins import TWINS, Twin
 
 _DRAWS: Final = 2000
+_SCREEN: Final = re.compile(r"missing_object\[([-\d.]+)_([-\d.]+)_to_([-\d.]+)_([-\d.]+)\]")
+_HALF_CELL: Final = 0.8
+"""m; of the grid on which missing walls are looked for."""
 
 
 class Answer(NamedTuple):
@@ -72,8 +76,26 @@ def needs_cause(twin: Twin, answers: Mapping[str, Answer]) -> bool:
 
 
 def is_right(twin: Twin, names: Sequence[str]) -> bool:
-    """Whether one of these effects undoes what is wrong with a twin."""
-    return any(name in twin.undone_by or name.partition("[")[0] in twin.undone_by for name in names)
+    """Whether one of these effects undoes what is wrong with a twin; of missing walls, one where the wall stands."""
+    return any(
+        (name in twin.undone_by or name.partition("[")[0] in twin.undone_by) and _is_there(twin, name)
+        for name in names
+    )
+
+
+def _is_there(twin: Twin, name: str) -> bool:
+    """Whether a screen runs along the wall that a twin lacks, at most half a cell beside it and beyond its ends."""
+    found = _SCREEN.fullmatch(name)
+    if twin.wall_ends is None or found is None:
+        return True
+    first, last = np.reshape([float(x) for x in found.groups()], (2, 2))
+    start, stop = np.reshape(twin.wall_ends, (2, 2))
+    middle, length = (first + last) / 2, float(np.linalg.norm(stop - start))
+    along = (stop - start) / length
+    place = float((middle - start) @ along)
+    beside = float(np.linalg.norm(middle - start - place * along))
+    is_parallel = abs(float((last - first) @ along)) > 0.5 * float(np.linalg.norm(last - first))
+    return is_parallel and beside < _HALF_CELL and -_HALF_CELL < place < length + _HALF_CELL
 
 
 def _total(extra: Float[np.ndarray, " link"]) -> tuple[float, float, float]:

@@ -30,6 +30,7 @@ class Twin(NamedTuple):
         undone_by: families, or instances, any of which is right; empty where nothing is wrong or where the unknown
             parameters of the twin undo it themselves.
         wall: number of the wall that the floor plan lacks.
+        wall_ends: where it stands, (x, y, x, y) in m.
         anchor: for each anchor's number, the place (x, y) in m that the table of links gives instead.
         bandwidth: factor on the radio's bandwidth, and on its tap's inverse.
         scene: settings of [scene] that differ.
@@ -39,6 +40,7 @@ class Twin(NamedTuple):
     wrong: str
     undone_by: tuple[str, ...] = ()
     wall: int | None = None
+    wall_ends: tuple[float, float, float, float] | None = None
     anchor: Mapping[int, tuple[float, float]] = {}
     bandwidth: float = 1.0
     scene: Mapping[str, Any] = {}
@@ -59,7 +61,13 @@ TWINS: Final = (
         anchor={2: (5.99, 5.37), 4: (7.76, 6.79)},
     ),
     Twin("depth", "one interaction at most", ("depth_cut_off",), scene={"max_depth": 1, "check_depth": 2}),
-    Twin("wall_13", "the wall at x = 4.7 m, 3.6 m long, is not there", ("missing_object",), wall=13),
+    Twin(
+        "wall_13",
+        "the wall at x = 4.7 m, 3.6 m long, is not there",
+        ("missing_object",),
+        wall=13,
+        wall_ends=(4.652, 5.879, 4.652, 9.498),
+    ),
     Twin("carrier", "the carrier is 4492.8 MHz", ("carrier_mismatch",), scene={"frequency": 4.4928e9}),
     Twin("bandwidth", "the bandwidth is 599 MHz", ("bandwidth_mismatch",), bandwidth=1.2),
     Twin(
@@ -81,14 +89,26 @@ TWINS: Final = (
         ("swapped_transmitters[2_3]",),
         anchor={5: (3.34, 2.35), 6: (3.15, 0.9)},
     ),
-    Twin("wall_5", "the wall at y = 4.8 m, 4.6 m long, is not there", ("missing_object",), wall=5),
+    Twin(
+        "wall_5",
+        "the wall at y = 4.8 m, 4.6 m long, is not there",
+        ("missing_object",),
+        wall=5,
+        wall_ends=(4.652, 4.799, 9.301, 4.799),
+    ),
     Twin(
         "anchor_5",
         "anchor 5 stands 0.5 m too far west",
         ("transmitter_displacement[transmitter_2]",),
         anchor={5: (2.65, 0.9)},
     ),
-    Twin("wall_2", "the wall at y = 3.4 m, 3.0 m long, is not there", ("missing_object",), wall=2),
+    Twin(
+        "wall_2",
+        "the wall at y = 3.4 m, 3.0 m long, is not there",
+        ("missing_object",),
+        wall=2,
+        wall_ends=(0.002, 3.379, 3.022, 3.379),
+    ),
 )
 """The honest twin first."""
 

@@ -42,7 +42,14 @@ def test_gaps_are_taken_on_links_that_both_twins_reach():
 
 
 def test_an_answer_is_right_by_family_or_by_instance():
-    assert is_right(BY_NAME["wall_13"], ["missing_object[0_0_to_1_0]"])
+    for name, right in {
+        "missing_object[4.7_6.3_to_4.7_7.9]": True,
+        "missing_object[4.7_4.7_to_4.7_6.3]": True,
+        "missing_object[4.7_6.3_to_6.2_6.3]": False,  # across it
+        "missing_object[3.1_6.3_to_3.1_7.9]": False,  # too far beside it
+        "missing_object[4.7_0_to_4.7_1.6]": False,  # along its line, beyond its end
+    }.items():
+        assert is_right(BY_NAME["wall_13"], [name]) == right
     assert not is_right(BY_NAME["wall_13"], ["missing_path[reflection]", ""])
     assert is_right(BY_NAME["swap_2_4"], ["carrier_mismatch", "swapped_transmitters[4_5]"])
     assert not is_right(BY_NAME["swap_2_4"], ["swapped_transmitters[5_6]"])
@@ -53,12 +60,12 @@ def made(monkeypatch, named_by, lost_by, known=("depth_cut_off", "receiver_displ
     """The figure of made-up answers: what each twin loses in nats of a link, and what is named in it."""
     base, asked = np.random.default_rng(0).normal(size=len(LINKS)), []
 
-    def diagnosed(twin, key, given, offered=None, *, say):
+    def diagnosed(twin, key, given, *, alone=False, say):
         del key, say
-        asked.append((twin.name, tuple(given), offered))
+        asked.append((twin.name, tuple(given), alone))
         lost = lost_by.get(twin.name, 0.0)
-        named = named_by.get(twin.name, "") if offered is None else offered[0]
-        won = (4.0 if offered is None else 1.0) if named else 0.0
+        named = twin.undone_by[0] if alone else named_by.get(twin.name, "")
+        won = (1.0 if alone else 4.0) if named else 0.0
         return answer(base + lost, base + lost - won, LINKS, named, (named,) if named else ())
 
     monkeypatch.setattr(apartment, "lacking", lambda key, say: known)
@@ -88,10 +95,8 @@ def test_what_the_honest_twin_lacks_is_known_to_all_and_missed_causes_get_a_seco
     named = {"swap_2_4": "swapped_transmitters[4_5]", "anchor_3": "scene_scale", "carrier": "scene_scale"}
     figure, asked = made(monkeypatch, named, {"swap_2_4": 5.0, "anchor_3": 5.0})
     assert {given for _, given, _ in asked} == {("depth_cut_off", "receiver_displacement[receiver_2]")}
-    assert [name for name, _, offered in asked if offered is None] == [twin.name for twin in TWINS]
-    assert [(name, offered) for name, _, offered in asked if offered is not None] == [
-        ("anchor_3", BY_NAME["anchor_3"].undone_by)  # the carrier's gap is not established
-    ]
+    assert [name for name, _, alone in asked if not alone] == [twin.name for twin in TWINS]
+    assert [name for name, _, alone in asked if alone] == ["anchor_3"]  # the carrier's gap is not established
     assert "depth_cut_off, receiver_displacement[receiver_2]" in figure.notes[0]
     assert "of its cause alone transmitter_displacement[transmitter_7] is accepted and closes 0.20" in next(
         note for note in figure.notes if "anchor_3" in note
@@ -131,6 +136,7 @@ def test_only_what_is_named_is_spoilt(measured, tmp_path, twin: Twin):
     assert moved == set(twin.anchor)
     plan, old = (json.loads((f / "floorplan.json").read_text()) for f in (copy, measured))
     gone = [n for n, wall in enumerate(old["walls_xyxy"]) if wall not in plan["walls_xyxy"]]
+    assert [tuple(old["walls_xyxy"][n]) for n in gone] == ([] if twin.wall_ends is None else [twin.wall_ends])
     assert gone == ([] if twin.wall is None else [twin.wall])
     radio, before = read_radio(copy), read_radio(measured)
     assert np.isclose(radio.bandwidth, twin.bandwidth * before.bandwidth)
