@@ -4,8 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Final
 
+import numpy as np
+
+from dtprob.gap.limits import Limit, correlation_matrix, is_resolvable, limit
 from dtprob.gap.settings import Settings
 from dtprob.gap.truths import PARAMETERS, SITES
 
@@ -142,6 +146,79 @@ class Answer:
             return []
         folds, size = Settings().folds, len(self.first.get("size", {}))
         return [closed["low"] <= 1 - size * folds / (folds - 1) / total <= closed["high"]]
+
+    @cached_property
+    def limit(self) -> Limit | None:
+        """What the best possible diagnosis reaches; None where there is not one effect, or the report cannot tell."""
+        effects, alike = self.truth["effects"], self._alike
+        if alike is None or len(effects) != 1 or effects[0]["name"] not in alike[0]:
+            return None
+        return limit(alike[1], alike[0].index(effects[0]["name"]), float(effects[0].get("lambda") or 0.0))
+
+    @property
+    def _alike(self) -> tuple[list[str], np.ndarray] | None:
+        """The candidates of the report, and the correlations of their scores."""
+        alike = (self.report or {}).get("provenance", {}).get("alike")
+        return None if alike is None else (alike["effects"], correlation_matrix(alike["percent"]))
+
+    @property
+    def is_resolvable(self) -> bool:
+        """Whether each true effect can be told from every other candidate, as far as the report tells."""
+        alike = self._alike
+        known = [e for e in self.truth["effects"] if alike is not None and e["name"] in alike[0]]
+        return alike is not None and all(
+            is_resolvable(alike[1], alike[0].index(e["name"]), float(e.get("lambda") or 0.0)) for e in known
+        )
+
+    @property
+    def unexplained(self) -> float:
+        """Lambda that the best single candidate leaves, from its score: lambda (1 - R^2)."""
+        screening = (self.report or {}).get("screening") or []
+        best = max((float(line["z"] or 0.0) ** 2 for line in screening), default=0.0)
+        return max(self.lambda_ - max(best - 1, 0.0), 0.0)
+
+    def over_limit(self, of: Callable[[Limit], float]) -> list[tuple[float, float]]:
+        """Whether the right effect is first, and what the best possible diagnosis reaches."""
+        return [] if self.limit is None else [(float(self.is_right), of(self.limit))]
+
+    def screened_over_limit(self) -> list[tuple[float, float]]:
+        """Whether the right effect has the first place of the screening, and the chance of the best possible one."""
+        if self.limit is None or self.report is None or "where" not in self.report:
+            return []
+        return [(float({self.report["screening"][0]["effect"]} == self.effects), self.limit.first)]
+
+    def class_over_limit(self) -> list[tuple[float, float]]:
+        """Size of the class of a single effect, and that of the best possible one."""
+        if self.limit is None or len(self.named) != 1:
+            return []
+        return [(float(len(self.alias_class)), self.limit.class_size)]
+
+    def cell_scores(self) -> list[float]:
+        """F1 of the cells inside the reported blocks, for each axis on which the truth is local."""
+        if self.report is None or "where" not in self.report:
+            return []
+        blocks, scores = self.report["where"]["coordinates"], []
+        for axis, cells in self.truth.get("cells", {}).items():
+            said = {
+                i
+                for b in blocks
+                if axis in b["axes"]
+                for i in range(b["axes"][axis][0], b["axes"][axis][1] + 1)
+            }
+            scores.append(2 * len(said & set(cells)) / (len(said) + len(cells)))
+        return scores
+
+    def width(self) -> list[float]:
+        """Of the closed fraction's interval, where a right answer has one."""
+        closed = self.first.get("closed_fraction") if self.first else None
+        return [closed["high"] - closed["low"]] if closed and self.is_right else []
+
+    def remainder_closed(self) -> list[float]:
+        """Share that a model of the remainder closes on clusters left out; 0 where something is left and none was found."""
+        if self.report is None or "where" not in self.report or not self.is_unlisted:
+            return []
+        remainder = self.report.get("remainder")
+        return [float(remainder["closed_fraction"]["mean"] or 0.0) if remainder else 0.0]
 
     @staticmethod
     def closes(share: float) -> Callable[[Answer], list[bool]]:

@@ -10,6 +10,7 @@ import numpy as np
 from scipy import stats
 
 LEVEL: Final = 0.95
+_DRAWS: Final = 2000
 
 
 @dataclass(frozen=True)
@@ -58,6 +59,34 @@ def rates[T](
         if outcomes:
             found[name] = Rate(sum(outcomes), len(outcomes)).to_dict()
     return found
+
+
+def median(values: Sequence[float]) -> dict[str, Any]:
+    """Median of some values with its 95% interval, between two of the values in order (binomial)."""
+    ordered = np.sort(np.asarray(values, float))
+    n = len(ordered)
+    below = int(stats.binom.ppf((1 - LEVEL) / 2, n, 0.5))
+    low, high = ordered[max(below - 1, 0)], ordered[min(n - below, n - 1)]
+    return {"of": n, "value": float(np.median(ordered)), "low": float(low), "high": float(high)}
+
+
+def ratio(pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
+    """Ratio of two sums over cases, with its 95% interval by the bootstrap over cases."""
+    table = np.asarray(pairs, float)
+    index = np.random.default_rng(0).integers(len(table), size=(_DRAWS, len(table)))
+    drawn = table[index].sum(axis=1)
+    low, high = np.quantile(drawn[:, 0] / drawn[:, 1], [(1 - LEVEL) / 2, (1 + LEVEL) / 2])
+    value = float(table[:, 0].sum() / table[:, 1].sum())
+    return {"of": len(table), "value": value, "low": float(low), "high": float(high)}
+
+
+def over_limit(pairs: Sequence[tuple[float, float]]) -> dict[str, Any]:
+    """Share of successes over the mean of what could be reached, with the interval of the share, over that."""
+    reachable = float(np.mean([possible for _, possible in pairs]))
+    rate = Rate(int(sum(success for success, _ in pairs)), len(pairs))
+    low, high = rate.interval
+    found = {"of": rate.of, "value": rate.value / reachable, "low": low / reachable, "high": high / reachable}
+    return {**found, "limit": reachable}
 
 
 def quantiles(values: Sequence[float]) -> dict[str, float] | None:

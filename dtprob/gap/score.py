@@ -14,6 +14,8 @@ from dtprob.gap.targets import against_targets
 type Test = Callable[[Answer], Iterable[bool]]
 
 _LISTED_KINDS: Final = ("listed", "pair", "triple", "alias")
+_SHARED: Final = ("screening", "provenance")
+"""Parts of a report by which all methods are judged alike."""
 _EXACT: Final[Mapping[str, Test]] = {
     "right effect first": lambda answer: [answer.is_right],
     "right family first": lambda answer: [answer.is_right_family],
@@ -125,8 +127,9 @@ def _rival_answers(
     for name, said in rivals.items():
         for rival, report in said.items():
             own = answers[name]
+            seen = {part: own.report[part] for part in _SHARED if own.report and part in own.report}
             seconds = report.get("seconds")
-            found.setdefault(rival, {})[name] = Answer(own.track, own.truth, report, seconds)
+            found.setdefault(rival, {})[name] = Answer(own.track, own.truth, {**seen, **report}, seconds)
     return found
 
 
@@ -159,5 +162,7 @@ def _line(name: str, answer: Answer) -> dict[str, Any]:
         "named": sorted(answer.named),
         "probability": answer.first["probability"] if answer.first else None,
         "right": answer.is_right if answer.kind in _LISTED_KINDS else None,
+        "best_possible": answer.limit.named if answer.limit else None,
+        "unexplained": answer.unexplained if answer.kind == "unlisted" else None,
         "seconds": answer.seconds,
     }
