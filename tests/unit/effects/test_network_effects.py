@@ -8,6 +8,7 @@ import pytest
 from dtprob.effects import catalogue
 from dtprob.effects.effect import Rewriting
 from dtprob.effects.network import FAMILIES
+from dtprob.effects.network.laws import tilted
 from dtprob.models.declaration import declare, trace_model
 from dtprob.models.multi_access import multi_access, records
 from dtprob.testing import check_effect
@@ -83,6 +84,53 @@ def test_the_disconnection_of_the_report(offered, data):
     value = trace_model(multi_access, data, jax.random.key(0), tables)["arrival_logits"]["value"]
     after = jax.nn.softmax(effect.rewrites["arrival_logits"](value, {"loss": jnp.array(50.0)}, data))
     np.testing.assert_allclose(after[0, 0, 0], [0.6, 0.0, 0.4, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "name", ["arrival_rate_shift[device_0]", "cross_cluster_traffic[3_to_0]", "drift[device_0]"]
+)
+def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, data, name):
+    before, after = law(data, None), law(data, offered[name], log_odds=jnp.array(0.7))
+    grown = after.reshape(-1, *after.shape[-2:])
+    assert np.ptp(grown[:, 0, 1]) > 0.01 or name.startswith("arrival")
+    first = before[0, 0, 0]
+    with_, without = grown[:, 0, 2:], grown[:, 0, :2]
+    np.testing.assert_allclose(
+        with_ + without, np.broadcast_to(first[2:] + first[:2], with_.shape), rtol=1e-6
+    )
+    factor = (with_ / without) / (first[2:] / first[:2])
+    np.testing.assert_allclose(factor[:, 0], factor[:, 1], rtol=1e-5)
+    allowed = {"arrival": [np.exp(0.7)], "cross": [1.0, np.exp(0.7)]}.get(name.split("_")[0])
+    assert allowed is None or np.all(np.abs(factor[:, :1] - np.array(allowed)).min(axis=1) < 1e-4)
+    np.testing.assert_allclose(grown[:, 1], np.broadcast_to(before[0, 0, 1], grown[:, 1].shape), rtol=1e-6)
+
+
+def test_what_cannot_happen_still_cannot_when_a_device_changes():
+    logits = jnp.log(jnp.array([0.2, 0.4, 0.4, 0.0]))
+    after, slope = jax.value_and_grad(lambda c: jax.nn.softmax(tilted(logits, 1, c))[1])(jnp.array(0.7))
+    np.testing.assert_allclose(after, 0.6 * 2 * np.exp(0.7) / (1 + 2 * np.exp(0.7)), rtol=1e-6)
+    assert np.isfinite(slope)
+    assert slope > 0
+    assert np.isneginf(tilted(logits, 1, jnp.array(0.7))[3])
+
+
+def test_outages_come_after_outages(offered, data):
+    senders = np.asarray(data["sending"]).sum(-1)
+    table = np.exp(np.asarray(TABLES["log_reception"]))
+    mean = np.zeros(senders.shape)
+    for window, slot in np.ndindex(*senders.shape):
+        if slot:
+            n = senders[window, slot - 1]
+            heard = float(data["deliveries"][window, slot - 1] > 0)
+            new = heard - (1 - table[n, 0]) if n else 0.0
+            mean[window, slot] = 0.7 * mean[window, slot - 1] + 0.3 * new
+    lost = law(
+        data, offered["bursty_channel"], site="reception_logits", loss=jnp.log(2.0), memory=jnp.array(3.0)
+    )
+    wanted = 0.5 * table[senders] + 0.5 * (np.arange(5) == 0)
+    wanted = wanted * np.exp(3.0 * mean[..., None] * np.arange(5))
+    np.testing.assert_allclose(lost, wanted / wanted.sum(-1, keepdims=True), rtol=1e-4, atol=1e-6)
+    assert np.ptp(mean) > 0.2
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.gap.curves import curves
+from dtprob.gap.curves import curves, cycles
 from dtprob.gap.families import deterministic, families, observed, shifted
 from dtprob.gap.problem import Problem
 from tests.unit.gap.examples import bend, draw, line
@@ -55,8 +55,9 @@ def complex_site(problem, shape=(LENGTH, 3), axes=("row", "antenna")):
     return deterministic("gain", axes, value, gradients)
 
 
-def test_scores_are_the_slope_along_what_a_family_perturbs(problem):
-    site = complex_site(problem)
+@pytest.mark.parametrize("shape", [(LENGTH, 3), (LENGTH, 8)], ids=["short", "rows in order"])
+def test_scores_are_the_slope_along_what_a_family_perturbs(problem, shape):
+    site = complex_site(problem, shape)
     seen = set()
     for family, scores in families(partial(curves, problem), site):
         step = family.step(scores[0], np.ones(scores.shape[1]), site.value)
@@ -89,6 +90,26 @@ def test_curves_are_smooth_ripples_columns_and_groups(problem):
     assert not any("y" in name.split()[1:] for name in found)
     order = np.argsort(np.asarray(problem.data["x"]))
     assert np.all(np.diff(found["along x"][0][order]) < 0)
+
+
+def test_cycles_of_each_period_take_turns():
+    found = cycles(40)
+    assert list(found) == [2, 3, 4, 5, 6]
+    for period, phases in found.items():
+        np.testing.assert_array_equal(phases.toarray().argmax(0), np.arange(40) % period)
+        np.testing.assert_array_equal(phases.toarray().sum(0), 1.0)
+    assert cycles(11) == {}
+
+
+def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
+    value = np.zeros((10, 8, 2))
+    value.reshape(80, 2)[::7, 1] = 1.0
+    site = deterministic("load", ("window", "slot", "device"), np.zeros(value.shape), value[None])
+    found = {f.label: (f, s) for f, s in families(partial(curves, problem), site)}
+    family, scores = found["additive, every 7 along window and slot"]
+    assert np.count_nonzero(scores) == 1
+    step = family.step(scores[0], np.full(scores.shape[1], 12.0), site.value)
+    np.testing.assert_allclose(step, value, atol=1e-12)
 
 
 def test_short_axes_have_no_curves(problem):

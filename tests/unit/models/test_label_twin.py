@@ -8,6 +8,7 @@ import pytest
 from dtprob.case import load_case
 from dtprob.data import Labels
 from dtprob.effects import catalogue
+from dtprob.effects.effect import FIELD
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.settings import Settings
@@ -39,6 +40,26 @@ def test_model_and_effects_keep_their_contracts():
     assert {e.family for e in effects} == {"regional_bias", "scale_bias", "label_noise", "stale_map"}
     for effect in effects:
         check_effect(effect, label_twin, data)
+
+
+@pytest.mark.parametrize("n", [30, 400])
+def test_an_old_map_errs_alike_nearby(n):
+    data = rows(n=n)
+    effect = next(e for e in catalogue(declare(label_twin, data).sites, data) if e.family == "stale_map")
+    size = effect.field_shape(data["prediction"], data)[1]
+
+    def shift(field):
+        moved = effect.rewrites["predicted_label"](data["prediction"], {"scale": 2.0, FIELD: field}, data)
+        return moved - data["prediction"]
+
+    weights = np.asarray(jax.jacobian(shift)(jnp.zeros((1, size))))[:, 0] / 2
+    place = np.asarray(data["x"])[:, :2] / np.asarray(data["x"])[:, :2].std(0)
+    wanted = np.exp(-np.linalg.norm(place[:, None] - place[None], axis=-1))
+    found = weights @ weights.T
+    exact = np.isclose(np.diag(found), 1.0, atol=1e-4)  # the points themselves
+    assert exact.sum() >= min(n, 64)
+    np.testing.assert_allclose(found[exact][:, exact], wanted[exact][:, exact], atol=1e-3)
+    assert np.mean(np.abs(found - wanted)) < 0.03
 
 
 def test_the_error_is_the_root_mean_square():
