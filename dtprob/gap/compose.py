@@ -21,6 +21,10 @@ from dtprob.inference.engine import AbstractEngine
 _DRAWS = 200
 _MOST_ALIKE = 300
 """Candidates up to which a report tells how much each looks like each."""
+_PATHS = "path_gain"
+"""The site that has an entry for each path."""
+_MOST_STEPS = 200_000
+"""Steps of paths beyond which a scene is not drawn."""
 
 
 def compose(
@@ -274,7 +278,31 @@ def _maps(evidence: Evidence) -> dict[str, xr.Dataset]:
         "where": xr.Dataset({**where, **after}),
         group: xr.Dataset(clusters, attrs={"floor": entropy}),
         "screening": screening,
+        **_paths(evidence),
     }
+
+
+def _paths(evidence: Evidence) -> dict[str, xr.Dataset]:
+    """Each path of a traced scene with what it carries of the gap, and where it goes; nothing without a scene."""
+    before, after = (at.entries.get(_PATHS) for at in (evidence.before, evidence.after))
+    traced = next((v for v in evidence.problem.data.values() if hasattr(v, "vertex")), None)
+    if traced is None or before is None or after is None or before.shape != traced.mask.shape:
+        return {}
+    if traced.interaction.size > _MOST_STEPS:
+        return {}
+    steps = ("link", "path", "step")
+    content = {
+        "before": (steps[:2], before),
+        "after": (steps[:2], after),
+        "mask": (steps[:2], np.asarray(traced.mask)),
+        "interaction": (steps, np.asarray(traced.interaction)),
+        "object": (steps, np.asarray(traced.object)),
+        "vertex": ((*steps, "direction"), np.asarray(traced.vertex)),
+        "rx_position": (("link", "direction"), np.asarray(traced.rx_position)),
+        "tx_position": (("link", "direction"), np.asarray(traced.tx_position)),
+        "object_name": (("object_index",), np.array(traced.object_names, str)),
+    }
+    return {"paths": xr.Dataset(content)}
 
 
 def _seed(key: jax.Array) -> int:

@@ -7,8 +7,9 @@ all families of all sites.
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -90,13 +91,17 @@ class Suspect:
 
 @dataclass(frozen=True)
 class Location:
-    """Maps of the gap at one fit; the suspects come in order of falling evidence."""
+    """Maps of the gap at one fit; the suspects come in order of falling evidence.
+
+    `entries` holds, for sites of several axes, the nats above chance that a factor of its own would gain at each entry.
+    """
 
     sites: tuple[SiteFinding, ...]
     coordinates: tuple[CoordinateFinding, ...]
     axes: dict[str, np.ndarray]
     site_p_value: float
     suspects: tuple[Suspect, ...] = ()
+    entries: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
 def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> Location:
@@ -123,7 +128,22 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
         for s in _suspects(site, tests)
     ]
     suspects = tuple(sorted(named, key=lambda s: -s.evidence))
-    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0), suspects)
+    entries = {site.name: e for site, tests in zip(found, tested, strict=True) for e in _entries(site, tests)}
+    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0), suspects, entries)
+
+
+def _entries(site: Site, tests: Sequence[_Test]) -> Iterator[np.ndarray]:
+    """The map over the entries of a site of several axes."""
+    wide = tuple(i for i, n in enumerate(site.value.shape) if n > 1)
+    for test in tests if len(wide) > 1 else ():
+        if (
+            test.family.kind == "relative"
+            and test.family.pattern.kept == wide
+            and test.family.pattern.curves is None
+        ):
+            seen = test.variance > 1e-12 * max(float(test.variance.max(initial=0.0)), 1e-300)
+            gain = np.where(seen, 0.5 * (test.first[0] ** 2 / np.where(seen, test.variance, 1.0) - 1), 0.0)
+            yield gain.reshape(*site.value.shape, -1).sum(-1)
 
 
 def _suspects(site: Site, tests: Sequence[_Test]) -> list[Suspect]:

@@ -16,7 +16,8 @@ from dtprob.report.figures import (
     plan_view,
 )
 from dtprob.report.json_schema import Interval, Report
-from dtprob.report.names import capital, together, words
+from dtprob.report.names import capital, listing, together, words
+from dtprob.report.scene_view import Scene, scene, scene_view
 from dtprob.report.svg import inline_svg
 from dtprob.report.units import number, scale_for
 
@@ -129,6 +130,38 @@ def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     ]
 
 
+def scene_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
+    """The paths of a traced scene and the objects that they meet, before and after, in the same colours."""
+    if gap is None or "paths" not in gap.children:
+        return []
+    data = gap["paths"].to_dataset()
+    views = ["before"] if report["gap"]["after"] is None else ["before", "after"]
+    shown = {name: scene(data, name) for name in views}
+    if not shown["before"].lines:
+        return []
+    classes = classes_for(*(one.excess for one in shown.values()))
+    ends = [np.unique(data[name].values[:, :2], axis=0) for name in ("tx_position", "rx_position")]
+    return [
+        Chart(
+            inline_svg(
+                scene_view(one, ends[0], ends[1], classes=classes),
+                f"Scene from above, {_WHEN[name].lower()}: {len(one.lines)} paths; share of the excess on paths "
+                f"by way of {_carriers(one)}.",
+            ),
+            f"{_WHEN[name]}. {_LINES}",
+        )
+        for name, one in shown.items()
+    ]
+
+
+def _carriers(shown: Scene) -> str:
+    return listing(f"{words(name)} {100 * share:.0f}%" for name, _, _, share in shown.objects[:4])
+
+
+_LINES = (
+    "Lines are the paths that carry most of the gap, stronger where they carry more; grey ones fit. Squares are points on "
+    "objects; in percent: the part of the twin's excess that lies on paths by way of the object."
+)
 _DOTS = "Dots are receivers, triangles transmitters. The larger and stronger a dot, the worse its fit."
 _WHEN = {"before": "The twin as it is", "after": "With the cause added"}
 
@@ -203,6 +236,7 @@ def all_charts(report: Report, gap: xr.DataTree | None) -> Iterator[tuple[str, C
     if report["verdict"] == "NO_GAP":  # bars and colours would make noise look like a finding
         return
     yield from (("plan", chart) for chart in plan_charts(report, gap))
+    yield from (("scene", chart) for chart in scene_charts(report, gap))
     rest = remainder_chart(report)
     yield from (("remainder", chart) for chart in (rest,) if chart is not None)
     yield from (("far", chart) for chart in (gap_chart(report), closing_chart(report)) if chart is not None)

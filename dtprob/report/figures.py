@@ -234,7 +234,7 @@ def plan_view(
         axes.margins(0.06)
         axes.set_xlabel("x (m)")
         axes.set_ylabel("y (m)")
-        _legend_bar(axes, classes, label)
+        legend_bar(axes, classes, label)
         return figure
 
 
@@ -260,7 +260,7 @@ def _rows(names: Sequence[str], height: float) -> tuple[Figure, Axes]:
     return figure, axes
 
 
-def _legend_bar(axes: Axes, classes: Classes, label: str) -> None:
+def legend_bar(axes: Axes, classes: Classes, label: str) -> None:
     """The classes' colours in a row above the view, with their edges below them."""
     bar = axes.inset_axes((0.0, 1.1, 1.0, 0.045))
     count = len(classes.colours)
