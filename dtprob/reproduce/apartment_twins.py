@@ -207,7 +207,7 @@ def _case(twin: Twin, known: Sequence[str], offered: Sequence[str] | None) -> st
     scene["check_transmitters"] = any(name in _SWAPS for name in offered)
     sections: dict[str, Mapping[str, Any]] = {
         "model": {"name": "ultra_wideband_channel"},
-        "model.options": {"time_origin": "ranged", "model_error": 0.5},
+        "model.options": {"time_origin": "ranged", "model_error": 0.5, "materials": "known"},
         "data": {"file": NAME, "phase": "per_packet"},
         "data.options": {"averages": 2, "level": "reported", "links": list(LINKS)},
         "scene": scene,
