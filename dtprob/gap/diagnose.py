@@ -24,7 +24,7 @@ from dtprob.gap.search import search
 from dtprob.gap.settings import Settings
 from dtprob.gap.shares import shares
 from dtprob.gap.soundness import idle, notes
-from dtprob.gap.trials import Say
+from dtprob.gap.trials import Say, credit
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.declaration import Data, Model
@@ -148,8 +148,8 @@ def alternatives(evidence: Evidence, settings: Settings) -> tuple[tuple[tuple[st
     """Sets that differ from the accepted one in one effect and that the data cannot rule out; its probability."""
     found = evidence.explanations
     names = list(found)
-    evidences = np.array([found[n].fitted.log_evidence for n in names])
-    weights = np.exp(evidences - evidences.max())
+    worth = np.array([credit(evidence.problem, found[n].fitted, evidence.base) for n in names])
+    weights = np.exp(worth - worth.max())
     weights /= weights.sum()
     order = np.argsort(-weights)
     held = np.cumsum(weights[order])

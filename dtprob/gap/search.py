@@ -16,7 +16,7 @@ from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
 from dtprob.gap.refit import at_null_except, without
 from dtprob.gap.settings import Settings
-from dtprob.gap.trials import Say, Start, Trials, best, tried
+from dtprob.gap.trials import Say, Start, Trials, best, credit, tried
 from dtprob.gap.view import View, view
 
 _RETURNS: Final = 3
@@ -38,7 +38,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     """Steps from the base fit until nothing is significant or worth its prior; the last step accepts nothing.
 
     Where a random field was accepted, which can imitate several effects at once, the search goes on without it too, and the
-    set with the larger evidence stands.
+    set of more credit stands.
 
     Args:
         problem: the model and candidates on their data.
@@ -56,8 +56,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     say(f"looking for effects that {field} may have imitated")
     rest = _refitted_without(end.problem, end.fitted, field)
     others = _forward(end.problem, rest, jax.random.fold_in(key, 1), settings, say, base=base, banned=field)
-    better = others[-1].view.fitted.log_evidence >= end.fitted.log_evidence
-    return [*steps[:-1], *others] if better else steps
+    with_it, without_it = (credit(problem, one.fitted, base) for one in (end, others[-1].view))
+    return [*steps[:-1], *others] if without_it >= with_it else steps
 
 
 def _forward(

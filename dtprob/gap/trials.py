@@ -23,10 +23,10 @@ _LARGEST_FIELD: Final = 256
 """Entries of a field per cluster up to which it is fitted entry by entry."""
 _LARGEST_TANGENTS: Final = 100_000_000
 """Numbers that the tangents of a field may take: 0.8 GB."""
-_PREFERRED: Final = 0.97
-"""Share of a random field's gain at which an effect with parameters of its own is preferred."""
-_AS_GOOD: Final = 3.0
-"""Nats by which such an effect may fall behind in any case."""
+_FIELD_SHARE: Final = 0.03
+"""Share of what was gained over the base fit that a random field has to be better by."""
+_FIELD_NATS: Final = 3.0
+"""Nats that it has to be better by in any case."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 
@@ -92,23 +92,29 @@ def tried(
     return Trials(problem, polished(problem, start, trials, settings.polished))
 
 
-def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:
-    """The refit with the largest evidence, if it outweighs the choice among all candidates and is no minor matter.
+def credit(problem: Problem, fitted: fitting.Fit, base: fitting.Fit) -> float:
+    """Log evidence of a fit, less what each random field has to be better by: it can imitate nearly anything.
 
-    A random field can imitate nearly anything, so an effect with parameters of its own is preferred when it reaches nearly
-    its evidence; what the field would add on top is left to the next step.
+    Args:
+        problem: whose effects were fitted.
+        fitted: the fit.
+        base: the fit of the model alone.
     """
+    kinds = {e.name: e.kind for e in problem.effects}
+    fields = sum(kinds[name] == "variance" for name in fitted.effects)
+    gained = fitted.log_evidence - base.log_evidence
+    return fitted.log_evidence - fields * max(_FIELD_NATS, _FIELD_SHARE * gained)
+
+
+def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:
+    """The refit of most credit, if it outweighs the choice among all candidates and is no minor matter."""
     if not trials:
         return None
-    fitted, kinds = seen.fitted, {e.name: e.kind for e in seen.problem.effects}
-    gain = {name: trial.log_evidence - fitted.log_evidence for name, trial in trials.items()}
-    chosen = max(gain, key=lambda name: gain[name])
-    plain = {name: value for name, value in gain.items() if kinds[name] == "mean"}
-    if plain and max(plain.values()) >= min(_PREFERRED * gain[chosen], gain[chosen] - _AS_GOOD):
-        chosen = max(plain, key=lambda name: plain[name])
+    fitted = seen.fitted
+    chosen = max(trials, key=lambda name: credit(seen.problem, trials[name], base))
     so_far = fitted.log_evidence - base.log_evidence
-    needed = max(np.log(len(kinds)) + 3.0, settings.minor * so_far)
-    return chosen if gain[chosen] > needed else None
+    needed = max(np.log(len(seen.problem.effects)) + 3.0, settings.minor * so_far)
+    return chosen if trials[chosen].log_evidence - fitted.log_evidence > needed else None
 
 
 def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:

@@ -7,6 +7,7 @@ import pytest
 from dtprob.gap.closed import ClosedFraction
 from dtprob.gap.diagnose import decide
 from dtprob.gap.settings import Settings
+from dtprob.gap.trials import best, credit
 
 
 def evidence(kind, p_after):
@@ -46,3 +47,19 @@ def test_verdicts(kind, closed, p_after, verdict):
 
 def test_no_cause_is_unlisted_where_a_site_is_wrong():
     assert decide(evidence("mean", 1e-6), (), Settings()) == "UNLISTED"
+
+
+@pytest.mark.parametrize(
+    ("gained", "chosen"),
+    [((20.0, 22.0), "plain"), ((20.0, 24.0), "field"), ((300.0, 308.0), "plain"), ((300.0, 312.0), "field")],
+)
+def test_a_random_field_has_to_be_better_by_a_margin(gained, chosen):
+    effects = [SimpleNamespace(name="plain", kind="mean"), SimpleNamespace(name="field", kind="variance")]
+    problem, base = SimpleNamespace(effects=effects), SimpleNamespace(effects=(), log_evidence=-1000.0)
+    trials = {
+        effect.name: SimpleNamespace(effects=(effect.name,), log_evidence=-1000.0 + gain)
+        for effect, gain in zip(effects, gained, strict=True)
+    }
+    view = SimpleNamespace(problem=problem, fitted=base)
+    assert best(view, base, trials, Settings()) == chosen
+    assert credit(problem, trials["plain"], base) == trials["plain"].log_evidence
