@@ -215,9 +215,9 @@ class Answer:
 
     def remainder_closed(self) -> list[float]:
         """Share that a model of the remainder closes on clusters left out; 0 where something is left and none was found."""
-        if self.report is None or "where" not in self.report or not self.is_unlisted:
+        if self.report is None or "remainder" not in self.report or not self.is_unlisted:
             return []
-        remainder = self.report.get("remainder")
+        remainder = self.report["remainder"]
         return [float(remainder["closed_fraction"]["mean"] or 0.0) if remainder else 0.0]
 
     @staticmethod
