@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property
-from typing import Any, NamedTuple, final
+from typing import Any, Final, NamedTuple, final
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,8 @@ from dtprob.gap import whiten
 from dtprob.gap.quick import quick_jit
 from dtprob.gap.running import Outcome, Runner
 
-_CHUNK = 16
+CHUNK: Final = 16
+"""Directions or perturbations that go through a compiled program at a time."""
 _DECIBELS = 10.0 / np.log(10.0)
 
 
@@ -58,10 +59,10 @@ class Compiled:
             return jax.lax.map(one, xs)
 
         def chunked(xs: np.ndarray) -> np.ndarray:
-            padded = np.concatenate([xs, np.repeat(xs[-1:], -len(xs) % _CHUNK, axis=0)])
+            padded = np.concatenate([xs, np.repeat(xs[-1:], -len(xs) % CHUNK, axis=0)])
             parts = [
-                profile(jnp.asarray(padded[i : i + _CHUNK]), self._arrays)
-                for i in range(0, len(padded), _CHUNK)
+                profile(jnp.asarray(padded[i : i + CHUNK]), self._arrays)
+                for i in range(0, len(padded), CHUNK)
             ]
             return np.concatenate([np.asarray(p) for p in parts])[: len(xs)]
 
@@ -197,16 +198,16 @@ class Compiled:
 
     def _padded(self, deltas: Mapping[str, Any], n: int) -> Iterator[dict[str, jax.Array]]:
         """Perturbations of all sites in chunks of one size, zero where none is given."""
-        for start in range(0, n, _CHUNK):
+        for start in range(0, n, CHUNK):
             chunk = dict(self._nowhere)
             for name, given in deltas.items():
-                chunk[name] = _filled(np.asarray(given[start : start + _CHUNK]), self._nowhere[name])
+                chunk[name] = _filled(np.asarray(given[start : start + CHUNK]), self._nowhere[name])
             yield chunk
 
     @cached_property
     def _nowhere(self) -> dict[str, jax.Array]:
         """One chunk of perturbations that perturb nothing."""
-        return {n: jnp.zeros((_CHUNK, *s.shape), s.dtype) for n, s in self._float_sites.items()}
+        return {n: jnp.zeros((CHUNK, *s.shape), s.dtype) for n, s in self._float_sites.items()}
 
     @cached_property
     def _state(self) -> Callable[[np.ndarray], _State]:
@@ -277,10 +278,10 @@ def _filled(given: np.ndarray, like: jax.Array) -> jax.Array:
 
 def _chunks(basis: np.ndarray) -> Iterator[jax.Array]:
     """Rows of a basis in chunks of one size, at least one, the last filled up with zeros."""
-    count = max(-(-len(basis) // _CHUNK), 1)
-    padded = np.concatenate([basis, np.zeros((count * _CHUNK - len(basis), basis.shape[1]))])
-    for start in range(0, len(padded), _CHUNK):
-        yield jnp.asarray(padded[start : start + _CHUNK])
+    count = max(-(-len(basis) // CHUNK), 1)
+    padded = np.concatenate([basis, np.zeros((count * CHUNK - len(basis), basis.shape[1]))])
+    for start in range(0, len(padded), CHUNK):
+        yield jnp.asarray(padded[start : start + CHUNK])
 
 
 def _squared_error(

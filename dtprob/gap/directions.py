@@ -18,6 +18,7 @@ import numpy as np
 
 from dtprob.effects.effect import Context, Effect
 from dtprob.gap import whiten
+from dtprob.gap.compiled import CHUNK
 from dtprob.gap.problem import Problem
 from dtprob.gap.programs import Programs, null_vector, unflatten
 from dtprob.gap.quick import quick_jit
@@ -87,13 +88,13 @@ class Tangents:
     Attributes:
         effects: in the order of the columns.
         groups: for each effect its columns.
-        columns: (cluster, row, column).
+        columns: (cluster, row, column); by far the largest array of a diagnosis, so no copy of it is made.
         extra: rows beyond the base model's, by effect name.
     """
 
     effects: tuple[Effect, ...]
     groups: tuple[np.ndarray, ...]
-    columns: jax.Array
+    columns: np.ndarray
     extra: Mapping[str, tuple[Extra, ...]]
 
 
@@ -107,31 +108,34 @@ def tangents(around: Surroundings, effects: Sequence[Effect], programs: Programs
     problem = around.problem
     sizes = [e.dimension for e in effects]
     groups = tuple(np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])) if effects else ()
-    deltas = (
-        {n: np.zeros((sum(sizes), *s.shape), s.dtype) for n, s in problem.float_sites.items()}
-        if effects
-        else {}
-    )
-    direct: list[tuple[np.ndarray, jax.Array]] = []
-    extra: dict[str, tuple[Extra, ...]] = {}
-    touched: set[str] = set()
+    columns = np.zeros((*problem.rows.gather.shape, sum(sizes)))
     found = programs.site_tangents(around.grown())
+    places = [(effect.name, j) for effect in effects for j in range(effect.dimension)]
+    for low in range(0, len(places), CHUNK):
+        part = places[low : low + CHUNK]
+        deltas = _deltas(problem, found, part)
+        if deltas:
+            columns[..., low : low + len(part)] = problem.compiled.site_shift(around.x, deltas)
+    extra: dict[str, tuple[Extra, ...]] = {}
     for effect, group in zip(effects, groups, strict=True):
-        for site in effect.rewrites:
-            if site in deltas:
-                tangent = np.moveaxis(np.asarray(found[effect.name][site]), -1, 0)
-                deltas[site][group] = np.stack([np.broadcast_to(t, deltas[site].shape[1:]) for t in tangent])
-                touched.add(site)
-        rows, own = _distribution_tangents(around, effect)
+        rows, extra[effect.name] = _distribution_tangents(around, effect)
         if rows is not None:
-            direct.append((group, rows))
-        extra[effect.name] = own
-    columns = jnp.zeros((*problem.rows.gather.shape, sum(sizes)))
-    if touched:
-        columns = problem.compiled.site_shift(around.x, {n: deltas[n] for n in touched})
-    for group, rows in direct:
-        columns = columns.at[..., group].add(rows)
+            columns[..., group] += rows
     return Tangents(tuple(effects), groups, columns, extra)
+
+
+def _deltas(
+    problem: Problem, found: Mapping[str, Mapping[str, jax.Array]], places: Sequence[tuple[str, int]]
+) -> dict[str, np.ndarray]:
+    """Perturbations (n, *site) of the sites that some parameters (effect, number) move."""
+    deltas: dict[str, np.ndarray] = {}
+    for i, (name, j) in enumerate(places):
+        for site, tangent in found.get(name, {}).items():
+            if site in problem.float_sites:
+                like = problem.float_sites[site]
+                into = deltas.setdefault(site, np.zeros((len(places), *like.shape), like.dtype))
+                into[i] = np.asarray(tangent)[..., j]
+    return deltas
 
 
 def _distribution_tangents(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,6 +16,8 @@ from dtprob.gap.problem import Problem
 
 _FAINT: Final = 1e-3
 """Share of the data's information on a coordinate below which its prior's is not looked at."""
+_TOGETHER: Final = 32
+"""Clusters whose projected columns are held at once."""
 _ROUNDING: Final = 1e-9
 """What is left of a coordinate after its fit is taken back, as a share of the fit, is zero below this."""
 
@@ -91,6 +93,40 @@ class Projection:
         cross = jnp.einsum("cmg,cmk->gk", self.reduced, w)
         coefficients = self.global_inverse @ cross
         return w - jnp.einsum("cmg,gk->cmk", self.reduced, coefficients), coefficients
+
+    def information(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """W' P W and B's part that falls on the global nuisances, of effect columns W (cluster, row, k).
+
+        P W, the columns after projection, are made of a few clusters at a time.
+        """
+        parts = [slice(low, low + _TOGETHER) for low in range(0, len(w), _TOGETHER)]
+        cross = sum((_product(self.reduced[c], self._without_local(w[c], c)) for c in parts), np.zeros(()))
+        coefficients = np.asarray(self.global_inverse) @ cross
+        found = np.zeros((w.shape[-1], w.shape[-1]))
+        for c in parts:
+            adjusted = self._without_local(w[c], c) - np.asarray(self.reduced[c]) @ coefficients
+            found += _product(w[c], adjusted)
+        return found, coefficients
+
+    def _without_local(self, w: np.ndarray, clusters: slice) -> np.ndarray:
+        """Columns (cluster, row, k) of some clusters, their local coordinates projected away."""
+        own = np.asarray(self.local_columns[clusters])
+        if not own.shape[-1]:
+            return w
+        return w - own @ (np.asarray(self.local_inverse[clusters]) @ (np.swapaxes(own, 1, 2) @ w))
+
+    def adjoint(self, e: jax.Array) -> jax.Array:
+        """Rows P' e (..., cluster, row), whose products with columns W are those of e with P W."""
+        score = jnp.einsum("cmg,...cm->...g", self.reduced, e)
+        e = e - jnp.einsum("cmg,gh,...h->...cm", self.reduced, self.global_inverse, score)
+        local = jnp.einsum("cml,...cm->...cl", self.local_columns, e)
+        return e - jnp.einsum("cml,clk,...ck->...cm", self.local_columns, self.local_inverse, local)
+
+
+def _product(left: Any, right: np.ndarray) -> np.ndarray:
+    """Sum over clusters and rows of columns (cluster, row, i) times columns (cluster, row, j)."""
+    entries = left.shape[0] * left.shape[1]
+    return np.asarray(left).reshape(entries, left.shape[-1]).T @ right.reshape(entries, right.shape[-1])
 
 
 def project(problem: Problem, fitted: fitting.Fit) -> Projection:

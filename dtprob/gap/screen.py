@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
@@ -158,10 +157,9 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
         drawn: the data and replicates at the fit.
         found: the effects' tangents there.
     """
-    adjusted, coefficients = projection.adjust(found.columns)
-    information = np.array(jnp.einsum("cmi,cmj->ij", found.columns, adjusted))
-    total = np.array(jnp.einsum("cmi,cmi->i", found.columns, found.columns))
-    u = np.array(jnp.einsum("cmk,cm->k", adjusted, drawn.raw))
+    information, coefficients = projection.information(found.columns)
+    total = np.einsum("cmi,cmi->i", found.columns, found.columns)
+    u = _products(projection.adjoint(drawn.raw), found)
     values = problem.observed_values
     for effect, group in zip(found.effects, found.groups, strict=True):
         for extra in found.extra[effect.name]:
@@ -169,20 +167,27 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
             information[np.ix_(group, group)] += own
             total[group] += np.diag(own)
             u[group] += extra.score(values[extra.site][None])[0]
-    u_null = np.concatenate([_replicate_scores(adjusted, found, *portion) for portion in drawn.portions()])
+    u_null = np.concatenate([_replicate_scores(projection, found, *portion) for portion in drawn.portions()])
     information = (information + information.T) / 2
     return Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
 
 
 def _replicate_scores(
-    adjusted: jax.Array, found: Tangents, rows: jax.Array, values: Mapping[str, jax.Array]
+    projection: Projection, found: Tangents, rows: jax.Array, values: Mapping[str, jax.Array]
 ) -> np.ndarray:
     """Scores (replicate, column) of mean effects."""
-    u = np.array(jnp.einsum("cmk,rcm->rk", adjusted, rows))
+    u = _products(projection.adjoint(rows), found)
     for effect, group in zip(found.effects, found.groups, strict=True):
         for extra in found.extra[effect.name]:
             u[:, group] += extra.score(values[extra.site])
     return u
+
+
+def _products(rows: jax.Array, found: Tangents) -> np.ndarray:
+    """Products (..., column) of rows (..., cluster, row) with the columns of mean effects."""
+    clusters, entries, count = found.columns.shape
+    flat = np.asarray(rows).reshape(*rows.shape[:-2], clusters * entries)
+    return flat @ found.columns.reshape(clusters * entries, count)
 
 
 def _mean_tests(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -44,7 +44,7 @@ class Look:
     projection: Projection
     drawn: Replicates
     effects: tuple[Effect, ...]
-    columns: jax.Array
+    columns: np.ndarray
     scores: Scores
     u: Float[np.ndarray, "n column"]
     unadjusted: Float[np.ndarray, "column column"]
@@ -138,7 +138,7 @@ def _field_gain(energy: np.ndarray) -> np.ndarray:
     return np.where(mean > 0, nu / 2 * (ratio - 1 - np.log(ratio)), 0.0).max(axis=1)
 
 
-def _unadjusted(scores: Scores, columns: jax.Array) -> np.ndarray:
+def _unadjusted(scores: Scores, columns: np.ndarray) -> np.ndarray:
     """Information without the nuisances' part; rows that only an effect's own distribution has are in its total."""
     information = np.array(jnp.einsum("cmi,cmj->ij", columns, columns))
     np.fill_diagonal(information, scores.total)
