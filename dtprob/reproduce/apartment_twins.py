@@ -204,6 +204,7 @@ def _case(twin: Twin, known: Sequence[str], offered: Sequence[str] | None) -> st
         swapped = any(name in _SWAPS for name in twin.undone_by)
         opaque = not scene["refraction"]
         offered = (*EFFECTS, *(["refraction_off"] if opaque else []), *(_SWAPS if swapped else []))
+    left_out = [name for name in LEFT_OUT if name.partition("[")[0] in offered]
     scene["check_transmitters"] = any(name in _SWAPS for name in offered)
     sections: dict[str, Mapping[str, Any]] = {
         "model": {"name": "ultra_wideband_channel"},
@@ -211,7 +212,7 @@ def _case(twin: Twin, known: Sequence[str], offered: Sequence[str] | None) -> st
         "data": {"file": NAME, "phase": "per_packet"},
         "data.options": {"averages": 2, "level": "reported", "links": list(LINKS)},
         "scene": scene,
-        "effects": {"use": list(offered), "exclude": list(LEFT_OUT), "known": list(known)},
+        "effects": {"use": list(offered), "exclude": left_out, "known": list(known)},
     }
     lines = [f"# A twin of the measured apartment; wrong: {twin.wrong}."]
     for name, content in sections.items():

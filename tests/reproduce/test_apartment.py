@@ -144,6 +144,18 @@ def test_only_what_is_named_is_spoilt(measured, tmp_path, twin: Twin):
 
 
 @pytest.mark.measured
+@pytest.mark.parametrize("twin", [twin for twin in TWINS if twin.undone_by], ids=lambda twin: twin.name)
+def test_a_case_leaves_out_only_what_it_offers(measured, tmp_path, twin: Twin):
+    del measured
+    for offered in (None, twin.undone_by):
+        case = load_case(write_case(twin, tmp_path, ("depth_cut_off",), offered))
+        families = {name.partition("[")[0] for name in case.effects.use}
+        assert {name.partition("[")[0] for name in case.effects.exclude} <= families
+        assert is_right(twin, case.effects.use)
+        assert case.effects.known == ("depth_cut_off",)
+
+
+@pytest.mark.measured
 def test_places_are_counted_over_the_links_that_are_reached(measured):
     links = {link.number: link for link in read_links(measured)}
     tags = np.unique([links[n].tag for n in LINKS], axis=0)
