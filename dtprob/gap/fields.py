@@ -72,12 +72,19 @@ def common_spread(
         scores: u, of the weights at zero.
         information: J of each weight.
     """
-    seen = information > 1e-12 * max(float(information.max(initial=0.0)), 1e-300)
-    if not seen.any():
-        return 0.0, 0.0
-    u, j = scores[seen], information[seen]
-    spread = _SPREADS[:, None] / np.sqrt(np.median(j))
-    inflated = 1 + spread**2 * j
-    evidence = 0.5 * (spread**2 * u**2 / inflated - np.log(inflated)).sum(axis=1)
+    spreads, terms = spread_terms(scores, information)
+    evidence = terms.sum(axis=1)
     best = int(evidence.argmax())
-    return float(spread[best, 0]), max(float(evidence[best]), 0.0)
+    return float(spreads[best]), max(float(evidence[best]), 0.0)
+
+
+def spread_terms(
+    scores: Float[np.ndarray, " weight"], information: Float[np.ndarray, " weight"]
+) -> tuple[Float[np.ndarray, " spread"], Float[np.ndarray, "spread weight"]]:
+    """The spreads that are tried, and what each weight adds to the log Bayes factor of each; see `common_spread`."""
+    seen = information > 1e-12 * max(float(information.max(initial=0.0)), 1e-300)
+    spreads = _SPREADS / np.sqrt(np.median(information[seen]) if seen.any() else 1.0)
+    u, j = np.where(seen, scores, 0.0), np.where(seen, information, 0.0)
+    square = spreads[:, None] ** 2
+    inflated = 1 + square * j
+    return spreads, 0.5 * (square * u**2 / inflated - np.log(inflated))

@@ -18,7 +18,7 @@ import numpy as np
 from dtprob.gap.bootstrap import Replicates
 from dtprob.gap.curves import curves
 from dtprob.gap.families import Family, Site, deterministic, families, observed, shifted
-from dtprob.gap.fields import common_spread
+from dtprob.gap.fields import common_spread, spread_terms
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
@@ -147,16 +147,43 @@ def _entries(site: Site, tests: Sequence[_Test]) -> Iterator[np.ndarray]:
 
 
 def _suspects(site: Site, tests: Sequence[_Test]) -> list[Suspect]:
-    """The families of a site that have the most evidence."""
-    found = [s for s in (_suspect(site, test) for test in tests) if s is not None]
-    return sorted(found, key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
+    """The families of a site that have the most evidence, ripples also narrowed to the half waves that bring it."""
+    whole = [test for test in tests if test.variance.size <= _MOST_WEIGHTS]
+    found = [_suspect(site, test) for test in whole]
+    found += [_suspect(site, narrow, price) for test in whole for narrow, price in _narrowed(test)]
+    return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
 
 
-def _suspect(site: Site, test: _Test) -> Suspect | None:
-    """A tested family as a suspect, if its evidence speaks for it."""
-    if test.variance.size > _MOST_WEIGHTS:
-        return None
+def _narrowed(test: _Test) -> Iterator[tuple[_Test, float]]:
+    """The ripple's band of 1, 2, 4 ... half waves with the most evidence, and the logarithm of how many there were."""
+    pattern = test.family.pattern
+    if not pattern.label.startswith("ripple") or not isinstance(pattern.curves, np.ndarray):
+        return
+    name, _, band = pattern.label.partition(", ")
+    low, count = int(band.split()[0]), len(pattern.curves)
+    _, terms = spread_terms(test.first[0], test.variance)
+    summed = np.cumsum(terms.reshape(len(terms), count, -1).sum(-1), axis=1)
+    summed = np.concatenate([np.zeros((len(terms), 1)), summed], axis=1)
+    lengths = 2 ** np.arange(int(np.log2(count)))
+    tops = [(summed[:, n:] - summed[:, :-n]).max(axis=0) for n in lengths]
+    top = max(range(len(tops)), key=lambda i: tops[i].max())
+    first = int(tops[top].argmax())
+    best = first, first + int(lengths[top])
+    label = f"{name}, {low + best[0]} to {low + best[1] - 1} half waves"
+    narrow = replace(test.family, pattern=replace(pattern, label=label, curves=pattern.curves[slice(*best)]))
+    parts = len(test.variance) // count
+    own = slice(best[0] * parts, best[1] * parts)
+    chances = sum(map(len, tops))
+    yield (
+        test._replace(family=narrow, first=test.first[:, own], variance=test.variance[own]),
+        float(np.log(chances)),
+    )
+
+
+def _suspect(site: Site, test: _Test, price: float = 0.0) -> Suspect | None:
+    """A tested family as a suspect, if its evidence less its price speaks for it."""
     spread, evidence = common_spread(test.first[0], test.variance)
+    evidence -= price
     return Suspect(site.name, site.rows, test.family, spread, evidence) if evidence > 0 else None
 
 

@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 import pytest
 from scipy import stats
 
-from dtprob.gap import closed
+from dtprob.gap import closed, where
 from dtprob.gap import fit as fitting
 from dtprob.gap.calibration import calibration
 from dtprob.gap.curves import curves
@@ -201,3 +201,21 @@ def test_predictions_of_a_right_model_are_calibrated():
     found = calibration(problem, parts)
     assert found.coverage == pytest.approx(0.9, abs=3.5 * np.sqrt(0.09 / N_ROW))
     assert found.error_ratio == pytest.approx(1.0, abs=3.5 / np.sqrt(2 * N_ROW))
+
+
+def test_a_ripple_is_narrowed_to_the_half_waves_that_bring_the_evidence():
+    """Of 32 scores of unit variance one is 8: its band alone has more evidence than all together."""
+    problem = prepared(rows(5))[0]
+    family = suspect(problem, "ripple in row, 33 to 64 half waves").family
+    scores = np.random.default_rng(0).normal(size=(9, 32))
+    scores[0, 5] = 8.0
+    test = where._Test(family, 0.0, np.ones(9), scores, np.ones(32))
+    site = SimpleNamespace(name="mean", rows=None)
+    found = where._suspects(site, [test])
+    assert [s.family.pattern.label for s in found] == [
+        "ripple in row, 38 to 38 half waves",
+        "ripple in row, 33 to 64 half waves",
+    ]
+    np.testing.assert_array_equal(found[0].family.pattern.curves, family.pattern.curves[5:6])
+    exact = 0.5 * (64 - 1 - np.log(64)) - np.log(32 + 31 + 29 + 25 + 17)
+    assert found[0].evidence == pytest.approx(exact, abs=0.1)
