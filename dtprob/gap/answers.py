@@ -172,10 +172,17 @@ class Answer:
 
     @property
     def unexplained(self) -> float:
-        """Lambda that the best single candidate leaves, from its score: lambda (1 - R^2)."""
-        screening = (self.report or {}).get("screening") or []
-        best = max((float(line["z"] or 0.0) ** 2 for line in screening), default=0.0)
-        return max(self.lambda_ - max(best - 1, 0.0), 0.0)
+        """Lambda that the candidates leave, lambda (1 - R^2).
+
+        They explain what the best score of a single one does, or twice the nats that the named cause gains on held-out
+        clusters, if that is more.
+        """
+        report = self.report or {}
+        best = max((float(line["z"] or 0.0) ** 2 for line in report.get("screening") or []), default=0.0)
+        gap, fit = report.get("gap", {}), report.get("fit", {})
+        known = gap.get("before") is not None and gap.get("after") is not None
+        gained = 2 * (gap["before"] - gap["after"]) * fit.get("n_observations", 0) if known else 0.0
+        return max(self.lambda_ - max(best - 1, gained, 0.0), 0.0)
 
     def over_limit(self, of: Callable[[Limit], float]) -> list[tuple[float, float]]:
         """Whether the right effect is first, and what the best possible diagnosis reaches."""

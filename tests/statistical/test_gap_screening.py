@@ -92,7 +92,7 @@ def test_correlations_of_scores(problem):
     x = np.asarray(data["x"]).ravel()
     left = projection_of(x)
     a, b = x**2, np.abs(x)
-    expected = abs(a @ left @ b) / np.sqrt(a @ left @ a * (b @ left @ b))
+    expected = -(a @ left @ b) / np.sqrt(a @ left @ a * (b @ left @ b))
     i, k = found.names.index("bend"), found.names.index("saturation")
     np.testing.assert_allclose(found.correlation[i, k], expected, rtol=1e-6)
 

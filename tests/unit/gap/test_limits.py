@@ -136,6 +136,15 @@ def test_the_rows_of_a_score():
     assert "\N{GREATER-THAN OR EQUAL TO} 0.97" in page
 
 
+def test_what_a_named_cause_gains_is_explained():
+    said = {**report("LISTED", "a", z=(3.0, 1.0)), "fit": {"n_observations": 100}}
+    for after, left in ((0.1, 100 - 2 * 100 * 0.2), (None, 100 - 8), (0.4, 100 - 8)):
+        answer = Answer(
+            "labels", case("0", "unlisted", "c"), {**said, "gap": {"before": 0.3, "after": after}}, None
+        )
+        assert answer.unexplained == pytest.approx(left)
+
+
 def test_an_answer_without_a_report_reaches_nothing():
     lost = Answer("labels", case("0", "listed", "a", cells={"sample": [1]}), None, None)
     assert lost.limit is None

@@ -1,0 +1,41 @@
+"""48 withheld cases of labels and of users' own models; see `tests.withheld_study` for what the bounds mean."""
+
+import pytest
+
+from tests.withheld_study import at_least, at_most, studied, summed
+
+KINDS = [*["null"] * 14, *["listed"] * 7, *["unlisted"] * 3]
+
+
+@pytest.fixture(scope="module")
+def found(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("tables")
+    return [studied(folder, track, KINDS, seed=20) for track in ("labels", "custom")]
+
+
+def test_false_alarms(found):
+    count, of = summed(found, "null", "alarm")
+    assert of == 28
+    assert count <= at_most(of, 0.01)
+
+
+@pytest.mark.parametrize(
+    ("kind", "name", "rate"),
+    [
+        ("listed", "right effect first", 0.9),
+        ("listed", "truth in the class", 0.95),
+        ("listed", "right site first", 0.95),
+        ("unlisted", "says unlisted", 0.6),
+        ("unlisted", "right site first", 0.8),
+    ],
+)
+def test_what_is_found(kind, name, rate, found):
+    count, of = summed(found, kind, name)
+    assert of == {"listed": 14, "unlisted": 6}[kind]
+    assert count >= at_least(of, rate)
+
+
+def test_nothing_of_this_size_is_missed(found):
+    count, of = summed(found, "listed", "missed")
+    assert of == 14
+    assert count <= at_most(of, 0.01)
