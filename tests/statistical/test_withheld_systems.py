@@ -1,0 +1,22 @@
+"""12 withheld cases of networks and of ray-traced channels; see `tests.withheld_study` for what the bounds mean."""
+
+import pytest
+
+from tests.withheld_study import at_most, studied
+
+
+def test_networks(tmp_path):
+    found = studied(tmp_path, "network", ["null", "null", "listed", "null", "null"] * 2, seed=20)
+    alarms, of = found["null"]["alarm"]
+    assert of == 8
+    assert alarms <= at_most(of, 0.01)
+    missed, of = found["listed"]["missed"]
+    assert missed <= at_most(of, 0.01)
+
+
+@pytest.mark.libllvm
+def test_channels(tmp_path):
+    found = studied(tmp_path, "channel", ["null", "null"], seed=20)
+    alarms, of = found["null"]["alarm"]
+    assert of == 2
+    assert alarms <= at_most(of, 0.01)
