@@ -127,7 +127,7 @@ PARAMETERS: Final[Mapping[str, Mapping[str, Sizes]]] = {
         "carrier_phase": _as_is,
         "gain_offset": lambda decibels: (decibels * np.log(10) / 20,),
     },
-    "network": {},
+    "network": {"arrival_rate_shift": lambda share: (-float(np.log1p(-share)),)},
     "labels": {"scale_bias": lambda slope: (float(np.log1p(slope)), float(np.log1p(-slope)))},
     "custom": {"wall": _as_is, "handover": _either},
 }

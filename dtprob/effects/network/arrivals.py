@@ -14,6 +14,7 @@ from dtprob.effects.network.laws import (
     ClustersLike,
     at,
     clusters_of,
+    joined,
     last_arrival,
     mix,
     of_device,
@@ -57,7 +58,7 @@ def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
 
 
 def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
-    """A device, or all of them, generate packets at another rate."""
+    """A device generates more packets, or all devices generate them at another rate."""
     clusters = _clusters(sites, data)
     if clusters is None:
         return []
@@ -73,18 +74,24 @@ def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
         )
     ]
     for device in range(clusters.devices):
+        cluster = int(clusters.cluster_of[device])
+        bit = int(clusters.weight[cluster, device])
 
-        def tilt(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
-            return of_device(value, clusters, device, p["log_odds"])
+        def add(
+            value: Any, p: Mapping[str, Any], _: Mapping[str, Any], cluster: int = cluster, bit: int = bit
+        ) -> Any:
+            own = at(cluster, value.shape[2])[:, None]
+            return jnp.where(own, mix(value, joined(value, bit), p["extra"]), value)
 
         effects.append(
             Effect(
                 "arrival_rate_shift",
-                {"arrival_logits": tilt},
-                (normal("log_odds", 1.0),),
+                {"arrival_logits": add},
+                (half_normal("extra", 1.0),),
                 instance=f"device_{device}",
-                physics=f"The odds of an arrival at device {device} change by a factor.",
-                source="Tilt of P(a_k | the others), which leaves the others' arrivals as they are.",
+                physics=f"Device {device} generates a packet with probability 1 - exp(-extra) where it would have none; "
+                "fewer packets are `device_disconnected`.",
+                source="Superposition: P(a) of outcomes without the device moves to those with it.",
                 requires=("clusters",),
             )
         )

@@ -84,6 +84,13 @@ def thinned(logits: Float[Array, "*batch outcome"], bit: int) -> Float[Array, "*
     return jnp.where(outcome & bit, 0.0, p + p[..., outcome ^ bit])
 
 
+def joined(logits: Float[Array, "*batch outcome"], bit: int) -> Float[Array, "*batch outcome"]:
+    """Probabilities of joint arrivals when the device of a binary digit generates a packet in every slot."""
+    p = jax.nn.softmax(logits)
+    outcome = np.arange(p.shape[-1])
+    return jnp.where(outcome & bit, p + p[..., outcome ^ bit], 0.0)
+
+
 def clusters_of(data: Mapping[str, Any]) -> ClustersLike | None:
     """The clusters of a network's data, None where these are other data."""
     found = data.get("clusters")

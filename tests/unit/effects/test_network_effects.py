@@ -86,13 +86,11 @@ def test_the_disconnection_of_the_report(offered, data):
     np.testing.assert_allclose(after[0, 0, 0], [0.6, 0.0, 0.4, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    "name", ["arrival_rate_shift[device_0]", "cross_cluster_traffic[3_to_0]", "drift[device_0]"]
-)
+@pytest.mark.parametrize("name", ["cross_cluster_traffic[3_to_0]", "drift[device_0]"])
 def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, data, name):
     before, after = law(data, None), law(data, offered[name], log_odds=jnp.array(0.7))
     grown = after.reshape(-1, *after.shape[-2:])
-    assert np.ptp(grown[:, 0, 1]) > 0.01 or name.startswith("arrival")
+    assert np.ptp(grown[:, 0, 1]) > 0.01
     first = before[0, 0, 0]
     with_, without = grown[:, 0, 2:], grown[:, 0, :2]
     np.testing.assert_allclose(
@@ -100,9 +98,15 @@ def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, da
     )
     factor = (with_ / without) / (first[2:] / first[:2])
     np.testing.assert_allclose(factor[:, 0], factor[:, 1], rtol=1e-5)
-    allowed = {"arrival": [np.exp(0.7)], "cross": [1.0, np.exp(0.7)]}.get(name.split("_")[0])
-    assert allowed is None or np.all(np.abs(factor[:, :1] - np.array(allowed)).min(axis=1) < 1e-4)
+    assert factor.min() < 1.001
+    assert factor.max() <= np.exp(0.7) * 1.001
     np.testing.assert_allclose(grown[:, 1], np.broadcast_to(before[0, 0, 1], grown[:, 1].shape), rtol=1e-6)
+
+
+def test_a_busier_device_adds_packets_and_leaves_its_neighbour_alone(offered, data):
+    after = law(data, offered["arrival_rate_shift[device_0]"], extra=jnp.log(2.0))
+    np.testing.assert_allclose(after[0, 0, 0], [0.1, 0.2, 0.4, 0.3], atol=1e-9)
+    np.testing.assert_allclose(after[0, 0, 1], [0.2, 0.4, 0.3, 0.1], atol=1e-9)
 
 
 def test_what_cannot_happen_still_cannot_when_a_device_changes():
