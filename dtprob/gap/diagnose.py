@@ -85,7 +85,7 @@ def diagnose(
 
 
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
-    keys = jax.random.split(key, 4)
+    keys = jax.random.split(key, 3)
     say(f"fitting the base model to {problem.n_cluster} clusters")
     base = fit_base(problem, keys[0], polished=settings.polished)
     noted = notes(problem, base)
@@ -95,7 +95,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     noted = (*noted, *idle(steps[0].view.screening.absorbed_by))
     base, last = steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
-    assignment = closed.folds(problem.n_cluster, keys[2], settings.folds)
+    assignment = closed.folds(problem.n_cluster, settings.folds)
     folds = list(closed.fold_fits(steps[0].view.problem, base, assignment))
     held_before = held_after = closed.judged(steps[0].view.problem, folds)
     if last.fitted.effects:
@@ -105,14 +105,14 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     left = max((s.gain for s in last.location.sites), default=0.0) if remains else 0.0
     bracket = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     fraction = (
-        closed.closed_fraction(held_before, held_after, bracket, keys[3]) if last.fitted.effects else None
+        closed.closed_fraction(held_before, held_after, bracket, keys[2]) if last.fitted.effects else None
     )
     held = held_before, held_after
-    parts = shares(last.problem, last.fitted, held, assignment, keys[3]) if fraction is not None else ()
+    parts = shares(last.problem, last.fitted, held, assignment, keys[2]) if fraction is not None else ()
     rest = None
     if remains and (fraction is None or fraction.mean < 1 - settings.minor):
         say("modelling what is left at its site")
-        rest = model_remainder(last, folds, held_after, bracket[1], keys[3])
+        rest = model_remainder(last, folds, held_after, bracket[1], keys[2])
     return Evidence(
         problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts, noted, remainder=rest
     )

@@ -115,7 +115,9 @@ def tangents(around: Surroundings, effects: Sequence[Effect], programs: Programs
         part = places[low : low + CHUNK]
         deltas = _deltas(problem, found, part)
         if deltas:
-            columns[..., low : low + len(part)] = problem.compiled.site_shift(around.x, deltas)
+            shifts = np.asarray(problem.compiled.site_shift(around.x, deltas))
+            finite = np.isfinite(shifts).all(axis=(0, 1))  # an effect without a derivative here says nothing
+            columns[..., low : low + len(part)] = np.where(finite, shifts, 0.0)
     extra: dict[str, tuple[Extra, ...]] = {}
     for effect, group in zip(effects, groups, strict=True):
         rows, extra[effect.name] = _distribution_tangents(around, effect)

@@ -22,7 +22,7 @@ def held(log_likelihood):
 
 @pytest.mark.parametrize(("n", "parts"), [(12, 4), (13, 4), (4, 8), (5, 1)])
 def test_folds_are_balanced(n, parts):
-    found = closed.folds(n, jax.random.key(0), parts)
+    found = closed.folds(n, parts)
     counts = np.bincount(found)
     assert found.shape == (n,)
     assert len(counts) == max(2, min(parts, n))
@@ -33,7 +33,7 @@ def test_cross_fit_judges_each_cluster_by_the_others():
     data = draw("line")
     problem = Problem(line, data, [bend()])
     x, y = np.asarray(data["x"]), np.asarray(data["y"])
-    assignment = closed.folds(12, jax.random.key(1), 3)
+    assignment = closed.folds(12, 3)
     found = closed.cross_fit(problem, fitting.fit(problem, np.zeros(2)), assignment)
     for fold in range(3):
         out = assignment == fold

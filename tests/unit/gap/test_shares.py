@@ -37,7 +37,7 @@ def shared(effects, shift):
     problem = Problem(line, data, effects).with_live([e.name for e in effects])
     base = fitting.fit(problem, problem.null())
     full = fitting.fit(problem, base.x, [e.name for e in effects])
-    assignment = closed.folds(12, jax.random.key(1), 4)
+    assignment = closed.folds(12, 4)
     held = closed.cross_fit(problem, base, assignment), closed.cross_fit(problem, full, assignment)
     return data, assignment, shares(problem, full, held, assignment, jax.random.key(2))
 
