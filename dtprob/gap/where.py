@@ -161,6 +161,8 @@ def _narrowed(test: _Test) -> Iterator[tuple[_Test, float]]:
         return
     name, _, band = pattern.label.partition(", ")
     low, count = int(band.split()[0]), len(pattern.curves)
+    if count == 1:
+        return
     _, terms = spread_terms(test.first[0], test.variance)
     summed = np.cumsum(terms.reshape(len(terms), count, -1).sum(-1), axis=1)
     summed = np.concatenate([np.zeros((len(terms), 1)), summed], axis=1)

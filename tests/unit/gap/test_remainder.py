@@ -1,5 +1,6 @@
 """The remainder at its site: against exact regression, calibrated in simulation, honest where nothing carries over."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -219,3 +220,14 @@ def test_a_ripple_is_narrowed_to_the_half_waves_that_bring_the_evidence():
     np.testing.assert_array_equal(found[0].family.pattern.curves, family.pattern.curves[5:6])
     exact = 0.5 * (64 - 1 - np.log(64)) - np.log(32 + 31 + 29 + 25 + 17)
     assert found[0].evidence == pytest.approx(exact, abs=0.1)
+
+
+def test_a_band_of_one_half_wave_is_left_as_it_is():
+    problem = prepared(rows(5))[0]
+    family = suspect(problem, "ripple in row, 33 to 64 half waves").family
+    one = replace(
+        family.pattern, label="ripple in row, 33 to 33 half waves", curves=family.pattern.curves[:1]
+    )
+    test = where._Test(replace(family, pattern=one), 0.0, np.ones(9), np.full((9, 1), 5.0), np.ones(1))
+    found = where._suspects(SimpleNamespace(name="mean", rows=None), [test])
+    assert [s.family.pattern.label for s in found] == [one.label]
