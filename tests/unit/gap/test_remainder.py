@@ -68,7 +68,7 @@ def prepared(data, model=table, cluster="street"):
     """The problem, its fit, the folds' fits and held-out results."""
     problem = Problem(model, data, [], cluster)
     fitted = fitting.fit(problem, np.zeros(1))
-    assignment = closed.folds(problem.n_cluster, jax.random.key(0), 4)
+    assignment = closed.folds(problem.n_cluster, 4)
     parts = list(closed.fold_fits(problem, fitted, assignment))
     return problem, fitted, parts, closed.judged(problem, parts)
 
