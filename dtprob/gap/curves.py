@@ -21,8 +21,8 @@ _CROSSED: Final = 3
 _MOST_PAIRS: Final = 6
 _LONGEST: Final = 24
 """Period of the longest cycle that is looked for; longer ones show as ripples."""
-_TURNS: Final = 6
-"""Times that a cycle has to come round."""
+_TURNS: Final = 24
+"""Times that a cycle has to come round: sums of a few entries are far from normal."""
 
 type Curve = np.ndarray | sparse.csr_matrix
 type Curves = dict[str, Curve]

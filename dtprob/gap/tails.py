@@ -31,6 +31,20 @@ def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> 
     return np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
 
 
+def variance_ratio_tail(observed: np.ndarray, mean: float, variance: float, replicates: int) -> np.ndarray:
+    """Upper-tail p-values of sums of squares, each over its variance in so many replicates: an F distribution.
+
+    Args:
+        observed: the sums.
+        mean: of the sum over replicates, above 0.
+        variance: likewise; with the mean it tells how many independent squares there are.
+        replicates: from which the variance of each square was taken.
+    """
+    squares = 2 * mean**2 / max(variance, 1e-12 * mean**2)
+    log_p = stats.f.logsf(observed / mean, squares, replicates * max(squares, 1.0))
+    return np.exp(np.maximum(log_p, LOG_SMALLEST))
+
+
 def log_gamma_tail(value: np.ndarray, shape: np.ndarray | float) -> np.ndarray:
     """Log upper-tail probability of a unit gamma, by its asymptote where the probability underflows."""
     log_p = stats.gamma.logsf(value, shape)

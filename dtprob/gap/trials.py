@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
@@ -27,6 +27,10 @@ _FIELD_SHARE: Final = 0.03
 """Share of what was gained over the base fit that a random field has to be better by."""
 _FIELD_NATS: Final = 3.0
 """Nats that it has to be better by in any case."""
+_LIVE: Final = 12
+"""Effects that are live at once, at most, where fewer are wanted."""
+_HOPELESS: Final = 0.05
+"""Share of the best candidate's promise below which another one is not refitted."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 
@@ -74,7 +78,7 @@ def tried(
         found = scan(seen.problem, seen.fitted.x, screening.names)
     scanned = np.array([found[n].gain if n in found else -np.inf for n in screening.names])
     chosen = [n for n in _chosen(seen, scanned, settings, banned) if n not in known]
-    problem = seen.problem.with_live([*fitted.effects, *known, *chosen])
+    problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
     effects = {e.name: e for e in problem.effects}
     trials = {
@@ -90,6 +94,15 @@ def tried(
             starts.append(_scanned_start(problem, seen.problem, effects[name], found[name]))
         trials[name] = refit(problem, start, effects[name], starts)
     return Trials(problem, polished(problem, start, trials, settings.polished))
+
+
+def _together(problem: Problem, names: Sequence[str]) -> Problem:
+    """The problem with these effects live, and beside them some that were before: a later step may come back to them.
+
+    Each set of live effects is compiled anew, so returning to one that is live already costs nothing.
+    """
+    before = [e.name for e in problem.live if e.kind == "mean" and e.name not in names]
+    return problem.with_live([*names, *before[: max(_LIVE - len(names), 0)]])
 
 
 def credit(problem: Problem, fitted: fitting.Fit, base: fitting.Fit) -> float:
@@ -131,9 +144,9 @@ def _chosen(seen: View, scanned: np.ndarray, settings: Settings, banned: str | N
         for i, name in enumerate(screening.names)
         if screening.absorbed_by[i] is None and name != banned and _affordable(seen.problem, name)
     ]
-    by_score = sorted(
-        (i for i in able if screening.log_bayes_factor[i] > 0), key=lambda i: -screening.log_bayes_factor[i]
-    )
+    gain = screening.log_bayes_factor
+    least = _HOPELESS * max((gain[i] for i in able), default=0.0)
+    by_score = sorted((i for i in able if gain[i] > max(least, 0.0)), key=lambda i: -gain[i])
     by_scan = sorted((i for i in able if scanned[i] > 3.0), key=lambda i: -scanned[i])
     half = settings.candidates // 2
     chosen = dict.fromkeys([*by_score[:half], *by_scan[:half], *by_score[half:], *by_scan[half:]])

@@ -22,7 +22,7 @@ from dtprob.gap.fields import common_spread, spread_terms
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
-from dtprob.gap.tails import family_wise, gamma_tail
+from dtprob.gap.tails import family_wise, gamma_tail, variance_ratio_tail
 
 _SURE = 0.005
 """Probability below which a site is surely wrong."""
@@ -227,10 +227,10 @@ def _family_test(family: Family, scores: np.ndarray) -> _Test:
     known = left_out > 1e-9 * total / n  # rare outcomes move an entry in one replicate and in no other
     statistic = (np.where(known, null**2, 0.0) / np.where(known, left_out, 1.0)).sum(1)
     value = float((given**2 / (total / n)).sum())
-    mean, spread = statistic.mean(), statistic.var()
-    p_null, _ = gamma_tail(statistic, np.asarray(mean), np.asarray(spread))
-    p, _ = gamma_tail(np.asarray([value]), np.asarray(mean), np.asarray(spread))
-    return _Test(family, float(p[0]), p_null, first, variance)
+    p = variance_ratio_tail(
+        np.append(statistic, value), float(statistic.mean()), float(statistic.var()), n - 1
+    )
+    return _Test(family, float(p[-1]), p[:-1], first, variance)
 
 
 def _finding(

@@ -93,22 +93,22 @@ def test_curves_are_smooth_ripples_columns_and_groups(problem):
 
 
 def test_cycles_of_each_period_take_turns():
-    found = cycles(40)
+    found = cycles(150)
     assert list(found) == [2, 3, 4, 5, 6]
     for period, phases in found.items():
-        np.testing.assert_array_equal(phases.toarray().argmax(0), np.arange(40) % period)
+        np.testing.assert_array_equal(phases.toarray().argmax(0), np.arange(150) % period)
         np.testing.assert_array_equal(phases.toarray().sum(0), 1.0)
-    assert cycles(11) == {}
+    assert cycles(47) == {}
 
 
 def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
-    value = np.zeros((10, 8, 2))
-    value.reshape(80, 2)[::7, 1] = 1.0
+    value = np.zeros((21, 8, 2))
+    value.reshape(168, 2)[::7, 1] = 1.0
     site = deterministic("load", ("window", "slot", "device"), np.zeros(value.shape), value[None])
     found = {f.label: (f, s) for f, s in families(partial(curves, problem), site)}
     family, scores = found["additive, every 7 along window and slot"]
     assert np.count_nonzero(scores) == 1
-    step = family.step(scores[0], np.full(scores.shape[1], 12.0), site.value)
+    step = family.step(scores[0], np.full(scores.shape[1], 24.0), site.value)
     np.testing.assert_allclose(step, value, atol=1e-12)
 
 

@@ -7,6 +7,7 @@ from scipy import stats
 
 from dtprob.gap.fields import field_tests
 from dtprob.gap.programs import _weights
+from dtprob.gap.tails import variance_ratio_tail
 
 INFORMATION = np.geomspace(0.1, 100.0, 24)
 
@@ -57,3 +58,12 @@ def test_the_smallest_of_the_replicates_is_over_all_effects():
     each = [field_tests({"x": e}, ["x"], 99).replicates for e in (one, other)]
     np.testing.assert_allclose(both.replicates, np.minimum(*each))
     assert field_tests({}, [], 7).replicates.shape == (7,)
+
+
+def test_a_square_over_a_variance_from_replicates_is_a_t():
+    values = np.array([1.0, 3.0, 5.0])
+    found = variance_ratio_tail(values**2, 1.0, 2.0, 98)
+    np.testing.assert_allclose(found, 2 * stats.t.sf(values, 98), rtol=1e-9)
+    many = variance_ratio_tail(np.array([20.0, 60.0]), 10.0, 20.0, 10**7)
+    np.testing.assert_allclose(many, stats.chi2.sf([20.0, 60.0], 10), rtol=1e-3)
+    assert variance_ratio_tail(np.array([1e300]), 1.0, 2.0, 98)[0] > 0
