@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from typing import Final
+from typing import Final, cast
 
 import equinox as eqx
 import numpy as np
@@ -26,6 +26,12 @@ _TURNS: Final = 24
 
 type Curve = np.ndarray | sparse.csr_matrix
 type Curves = dict[str, Curve]
+
+
+def extent(curve: Curve) -> tuple[int, int]:
+    """How many weights curves have, and along how many positions they run."""
+    weights, size = cast("tuple[int, int]", curve.shape)
+    return weights, size
 
 
 def curves(problem: Problem, axis: str, size: int) -> Curves:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final, cast
+from typing import Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.gap.curves import Curve, Curves, cycles
+from dtprob.gap.curves import Curve, Curves, cycles, extent
 from dtprob.gap.problem import Problem
 
 _ROWS: Final = 8
@@ -45,14 +45,14 @@ class Pattern:
         """Scores (n, weights) of the weights from those of the entries (n, *kept, part), other axes summed over."""
         if self.curves is None:
             return summed.reshape(len(summed), -1)
-        n, (_, size) = len(summed), _shape(self.curves)
+        n, (_, size) = len(summed), extent(self.curves)
         mixed = self.curves @ np.moveaxis(summed.reshape(n, size, -1), 1, 0).reshape(size, -1)
         return np.moveaxis(mixed.reshape(mixed.shape[0], n, -1), 0, 1).reshape(n, -1)
 
     def perturbation(self, weights: np.ndarray, shape: Sequence[int], parts: int) -> np.ndarray:
         """The entries (*site, part) that weights stand for; broadcasts to the site's shape."""
         along = (
-            weights if self.curves is None else self.curves.T @ weights.reshape(_shape(self.curves)[0], -1)
+            weights if self.curves is None else self.curves.T @ weights.reshape(extent(self.curves)[0], -1)
         )
         return along.reshape(*(n if i in self.kept else 1 for i, n in enumerate(shape)), parts)
 
@@ -109,11 +109,6 @@ class Site:
         """Scores (n, *site, part) of a perturbation of every entry."""
         entry = self.gradients * self.kinds[kind]
         return np.stack([np.real(entry), np.imag(entry)], -1) if np.iscomplexobj(entry) else entry[..., None]
-
-
-def _shape(curve: Curve) -> tuple[int, int]:
-    weights, size = np.shape(cast("np.ndarray", curve))
-    return weights, size
 
 
 def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients: np.ndarray) -> Site:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, cast
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +22,7 @@ from dtprob.gap import closed, whiten
 from dtprob.gap import fit as fitting
 from dtprob.gap.calibration import Calibration, calibration
 from dtprob.gap.closed import ClosedFraction, Fold, HeldOut
+from dtprob.gap.curves import extent
 from dtprob.gap.problem import Problem
 from dtprob.gap.view import View
 from dtprob.gap.where import Suspect
@@ -172,12 +173,13 @@ def _parts(suspect: Suspect, problem: Problem) -> int:
 
 
 def _field_shape(problem: Problem, suspect: Suspect) -> tuple[int, ...]:
-    """Shape of the random weights: axes of the site, one of the curves, one of the parts."""
+    """Shape of the random weights: axes of the site, one of the curves, one of what each curve has weights for."""
     shape, parts, pattern = _shape(problem, suspect), _parts(suspect, problem), suspect.family.pattern
     if pattern.curves is None:
         return (*(n if i in pattern.kept else 1 for i, n in enumerate(shape)), parts)
-    n = cast("tuple[int, ...]", pattern.curves.shape)[0]
-    return (n, parts) if _is_by_cluster(problem, suspect) else (*(1 for _ in shape), n, parts)
+    count, size = extent(pattern.curves)
+    each = int(np.prod([shape[i] for i in pattern.kept])) // size * parts
+    return (count, each) if _is_by_cluster(problem, suspect) else (*(1 for _ in shape), count, each)
 
 
 def _size(problem: Problem, suspect: Suspect) -> int:
@@ -189,7 +191,7 @@ def _is_by_cluster(problem: Problem, suspect: Suspect) -> bool:
     pattern = suspect.family.pattern
     if pattern.curves is None or pattern.label != f"by {problem.cluster_name}":
         return False
-    return cast("tuple[int, ...]", pattern.curves.shape)[0] == problem.n_cluster
+    return extent(pattern.curves)[0] == problem.n_cluster
 
 
 def _is_per_cluster(problem: Problem, suspect: Suspect) -> bool:
@@ -248,7 +250,7 @@ def _step(suspect: Suspect, shape: tuple[int, ...], parts: int) -> Callable[[Any
     dense = jnp.asarray(curves) if isinstance(curves, np.ndarray) else None
 
     def step(weights: Any) -> jax.Array:
-        pair = spread * weights.reshape(-1, parts)
+        pair = spread * (weights if curves is None else weights.reshape(extent(curves)[0], -1))
         along = pair if curves is None else pair[groups] if dense is None else dense.T @ pair
         along = along.reshape(*kept, parts)
         return factor * (along[..., 0] if parts == 1 else along[..., 0] + 1j * along[..., 1])

@@ -1,6 +1,7 @@
 """The remainder at its site: against exact regression, calibrated in simulation, honest where nothing carries over."""
 
 from dataclasses import replace
+from functools import partial
 from types import SimpleNamespace
 
 import jax
@@ -11,11 +12,12 @@ import numpyro.distributions as dist
 import pytest
 from scipy import stats
 
+from dtprob.effects.effect import FIELD
 from dtprob.gap import closed, where
 from dtprob.gap import fit as fitting
 from dtprob.gap.calibration import calibration
 from dtprob.gap.curves import curves
-from dtprob.gap.families import Family, Pattern
+from dtprob.gap.families import Family, Pattern, deterministic, families
 from dtprob.gap.fields import common_spread
 from dtprob.gap.problem import Problem
 from dtprob.gap.remainder import field_of, model_remainder, shortlist
@@ -131,6 +133,32 @@ def test_a_field_along_a_curve_is_exact_normal_regression():
     mean = whole[:, seen] @ np.linalg.solve(covariance(spread)[np.ix_(seen, seen)], data["y"][seen])
     predicted = np.asarray(wider.compiled.sites(found.x)["mean"])
     np.testing.assert_allclose(predicted, mean, atol=0.01)
+
+
+def log(window, y=None):
+    """A load in windows of eight slots, on two devices; each window has a number."""
+    del window
+    level = numpyro.sample("level", dist.Normal(0.0, 3.0))
+    with numpyro.plate("window", 21, dim=-3), numpyro.plate("slot", 8, dim=-2), numpyro.plate("device", 2):
+        load = numpyro.deterministic("load", jnp.broadcast_to(level, (21, 8, 2)))
+        numpyro.sample("y", dist.Normal(load, 1.0), obs=y)
+
+
+def test_a_field_moves_its_site_as_its_family_does():
+    rng = np.random.default_rng(0)
+    problem = Problem(log, {"window": np.arange(21) // 3, "y": rng.normal(size=(21, 8, 2))}, [], "window")
+    value = rng.normal(size=(21, 8, 2))
+    site = deterministic("load", ("window", "slot", "device"), value, rng.normal(size=(1, 21, 8, 2)))
+    seen = []
+    for family, scores in families(partial(curves, problem), site):
+        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0), positive=False)
+        weights = rng.normal(size=effect.shape_of_field(jnp.asarray(value), {}))
+        moved = effect.rewrites["load"](value, {"scale": 2.0, FIELD: weights}, {}) - value
+        assert weights.size == scores.shape[1]
+        wanted = family.pattern.perturbation(weights.reshape(-1), value.shape, 1)[..., 0] * family.factor
+        np.testing.assert_allclose(moved, np.broadcast_to(wanted, value.shape), atol=1e-12)
+        seen.append(family.pattern.label)
+    assert "every 7 along window and slot" in seen
 
 
 def test_what_all_clusters_share_carries_over():
