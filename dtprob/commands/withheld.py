@@ -6,10 +6,12 @@ import multiprocessing
 import os
 import warnings
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
+
+from pebble import ProcessExpired, ProcessPool
 
 from dtprob.commands.progress import Say, telling
 from dtprob.errors import InputError, unknown_name
@@ -23,10 +25,8 @@ TRACKS: Final = {
 }
 """For each track, the module whose `TRACK` writes its cases and their key."""
 
-_SHARED: Final = 4
-"""Cases that one worker takes in a row: neighbours are often alike and share compiled programs."""
-_LIFE: Final = 8
-"""Portions after which a worker is replaced, so that memory does not grow."""
+_LIFE: Final = 32
+"""Cases after which a worker is replaced, so that memory does not grow."""
 
 
 def generate(
@@ -97,16 +97,15 @@ def run(
         )
     wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
     todo = [n for n in found if not resume or any(not (out / n / file).is_file() for file in wanted)]
-    jobs = [
-        _Job(cases, out, names, wanted, seed=seed, no_code=no_code, resume=resume)
-        for names in _portions(todo)
-    ]
+    jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in todo]
     failed: list[str] = []
     with telling() as say:
         say(f"{len(todo)} of {len(found)} cases to diagnose")
-        for done, missed in enumerate(_answers(jobs, workers, say), start=1):
-            failed += missed
-            say(f"{min(done * _SHARED, len(todo))} of {len(todo)}")
+        for done, (name, error) in enumerate(_answers(jobs, workers, say), start=1):
+            if error is not None:
+                failed.append(name)
+                write_text(out / name / "error.txt", f"{error}\n")
+            say(f"{done} of {len(todo)}")
     if failed:
         raise RuntimeError(f"{len(failed)} cases failed, see error.txt of {', '.join(failed[:5])}")
 
@@ -149,41 +148,41 @@ def score(answers: Path, key: Path) -> None:
 
 @dataclass(frozen=True)
 class _Job:
-    """Cases for one worker, and which files of each are wanted."""
+    """A case for a worker, where its answers go, and which files are wanted."""
 
-    cases: Path
-    out: Path
-    names: Sequence[str]
+    case: Path
+    folder: Path
     wanted: Sequence[str]
     seed: int | None
     no_code: bool
     resume: bool
 
 
-def _portions(names: Sequence[str]) -> list[list[str]]:
-    return [list(names[i : i + _SHARED]) for i in range(0, len(names), _SHARED)]
-
-
-def _answers(jobs: Sequence[_Job], workers: int, say: Say) -> Iterator[list[str]]:
-    """The failed names of each portion, as the portions end."""
-    if not jobs:
-        return
+def _answers(jobs: Sequence[_Job], workers: int, say: Say) -> Iterator[tuple[str, str | None]]:
+    """The name of each case as it ends, and why it failed if it did; a worker that dies takes its one case with it."""
     context = multiprocessing.get_context("spawn")
-    with ProcessPoolExecutor(min(workers, len(jobs)), context, max_tasks_per_child=_LIFE) as pool:
-        waiting = [pool.submit(_diagnose_all, job) for job in jobs]
+    with ProcessPool(max(min(workers, len(jobs)), 1), max_tasks=_LIFE, context=context) as pool:
+        waiting: dict[Future[str | None], str] = {
+            pool.schedule(_diagnose, args=[job]): job.case.name for job in jobs
+        }
         try:
             for ended in as_completed(waiting):
-                yield ended.result()
+                death = ended.exception()
+                yield waiting[ended], ended.result() if death is None else _death(death)
         except BaseException:
             say("stopping")
-            for process in list(pool._processes.values()):  # noqa: SLF001  (no public way to end a worker at once)
-                process.terminate()
-            pool.shutdown(wait=False, cancel_futures=True)
+            pool.stop()
             raise
 
 
-def _diagnose_all(job: _Job) -> list[str]:
-    """Diagnose some cases in this process; the names of those that could not be."""
+def _death(error: BaseException) -> str:
+    if isinstance(error, ProcessExpired):
+        return f"its process ended with status {error.exitcode}: killed, or out of memory?"
+    raise error
+
+
+def _diagnose(job: _Job) -> str | None:
+    """Diagnose a case in this process; says why if that fails."""
     from dtprob.xla import avoid_miscompilation  # noqa: PLC0415
 
     avoid_miscompilation()
@@ -193,21 +192,17 @@ def _diagnose_all(job: _Job) -> list[str]:
 
     configure()
     warnings.simplefilter("ignore")  # a report says itself what there is to note
-    answers, failed = {"report.json": answer, "rivals.json": answer_of_rivals}, []
-    for name in job.names:
-        folder = job.out / name
-        folder.mkdir(parents=True, exist_ok=True)
-        try:
-            case = load_case(job.cases / name / "case.toml")
-            for file in job.wanted:
-                if not (job.resume and (folder / file).is_file()):
-                    answers[file](case, folder, seed=job.seed, no_code=job.no_code)
-        except Exception as error:  # noqa: BLE001  (one bad case must not end the others)
-            failed.append(name)
-            write_text(folder / "error.txt", f"{type(error).__name__}: {error}\n")
-        else:
-            (folder / "error.txt").unlink(missing_ok=True)
-    return failed
+    answers = {"report.json": answer, "rivals.json": answer_of_rivals}
+    job.folder.mkdir(parents=True, exist_ok=True)
+    try:
+        case = load_case(job.case / "case.toml")
+        for file in job.wanted:
+            if not (job.resume and (job.folder / file).is_file()):
+                answers[file](case, job.folder, seed=job.seed, no_code=job.no_code)
+    except Exception as error:  # noqa: BLE001  (one bad case must not end the others)
+        return f"{type(error).__name__}: {error}"
+    (job.folder / "error.txt").unlink(missing_ok=True)
+    return None
 
 
 def _optional(file: Path) -> dict[str, Any] | None:

@@ -100,6 +100,7 @@ def _weighted(active: Active, terms: np.ndarray) -> float:
     return value if np.isfinite(value) else -np.inf
 
 
+@np.errstate(over="ignore", invalid="ignore")  # bad starting points lead far out
 def fit(
     problem: Problem,
     x: np.ndarray,
@@ -129,6 +130,8 @@ def fit(
     latest: Changes = {}
     for _ in range(steps):
         system = _system(problem, active, x)
+        if not system.finite:
+            return _hopeless(active, x)
         trial = _better(problem, active, system, x, value=value, damping=damping, tolerance=tolerance)
         better = trial.value > value
         converged = trial.gain < tolerance or (not better and trial.damping > _STUCK)
@@ -145,7 +148,7 @@ def fit(
 
 
 def _hopeless(active: Active, x: np.ndarray) -> Fit:
-    """The fit of a starting point that leads nowhere, since the model is not finite there."""
+    """The fit of a starting point that leads where the model or its derivatives are not finite."""
     index, names = active.global_index, tuple(e.name for e in active.effects)
     return Fit(x, names, active.spread, -np.inf, -np.inf, np.eye(len(index)), index, False)
 

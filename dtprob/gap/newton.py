@@ -36,6 +36,11 @@ class System:
     local: Float[np.ndarray, "cluster local local"]
     weights: Float[np.ndarray, " cluster"]
 
+    @property
+    def finite(self) -> bool:
+        """Whether a step can be told: far out a curvature may overflow where the log posterior does not."""
+        return all(np.isfinite(part).all() for part in vars(self).values())
+
 
 class NewtonStep(NamedTuple):
     """How far to move, and the gain in log posterior that a quadratic promises."""

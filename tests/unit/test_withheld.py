@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dtprob.cli import main
+from dtprob.commands import withheld
 from dtprob.gap.rivals.compete import RIVALS
 from tests.unit.test_cli import CASE, EFFECTS, MODEL
 
@@ -98,6 +99,24 @@ def test_resume_keeps_answers(answered):
         == 0
     )
     assert file.stat().st_mtime_ns == before
+
+
+def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeypatch):
+    monkeypatch.setattr(withheld, "_LIFE", 2)
+    for name in "abcdef":
+        folder = tmp_path / "cases" / name
+        folder.mkdir(parents=True)
+        own = "import os, signal\nos.kill(os.getpid(), signal.SIGKILL)\n" if name == "b" else MODEL
+        (folder / "line_model.py").write_text(own)
+        (folder / "line_effects.py").write_text(EFFECTS)
+        (folder / "case.toml").write_text(CASE)
+    assert (
+        main(["withheld", "run", str(tmp_path / "cases"), "--out", str(tmp_path / "out"), "--workers", "1"])
+        == 1
+    )
+    told = {name: (tmp_path / "out" / name / "error.txt").read_text() for name in "abcdef"}
+    assert "ended with status -9" in told.pop("b")
+    assert all("line.csv" in text for text in told.values())
 
 
 @pytest.mark.parametrize(

@@ -3,10 +3,13 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 from scipy import optimize, stats
 from scipy.special import logsumexp
 
+from dtprob.effects import Effect, Parameter
 from dtprob.gap import fit as fitting
 from dtprob.gap.base import fit_base
 from dtprob.gap.newton import positive
@@ -250,3 +253,20 @@ def test_positive_does_not_depend_on_units():
     np.testing.assert_allclose(positive(scaled), scaled, rtol=1e-6, atol=0)
     wrong = np.diag([2.0, -3.0])
     assert np.linalg.eigvalsh(positive(wrong)).min() > 0
+
+
+def test_a_start_whose_curvature_overflows_leads_nowhere():
+    def level(x, y=None):
+        error = numpyro.sample("error", dist.LogNormal(jnp.log(3.0), 0.7))
+        mean = numpyro.deterministic("mean", x)
+        with numpyro.plate("row", len(x)):
+            numpyro.sample("y", dist.Normal(mean, error), obs=y)
+
+    shift = Effect(
+        "shift", {"mean": lambda v, p, c: v + p["size"]}, (Parameter("size", dist.Normal(0.0, 1.0)),)
+    )
+    with jax.enable_x64(False):  # in double precision it takes a far larger error
+        x = jnp.linspace(0, 1, 50)
+        problem = Problem(level, {"x": x, "y": x + 0.1}, [shift])
+        assert fitting.fit(problem, np.array([84.4])).log_posterior == -np.inf
+        assert np.isfinite(fit_base(problem, jax.random.key(0)).log_posterior)
