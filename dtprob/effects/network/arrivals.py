@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
-import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.network.laws import (
     ClustersLike,
-    at,
     clusters_of,
+    in_cluster_of,
     joined,
     last_arrival,
     mix,
@@ -34,14 +33,9 @@ def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
         return []
     effects: list[Effect] = []
     for device in range(clusters.devices):
-        cluster = int(clusters.cluster_of[device])
-        bit = int(clusters.weight[cluster, device])
 
-        def thin(
-            value: Any, p: Mapping[str, Any], _: Mapping[str, Any], cluster: int = cluster, bit: int = bit
-        ) -> Any:
-            own = at(cluster, value.shape[2])[:, None]
-            return jnp.where(own, mix(value, thinned(value, bit), p["loss"]), value)
+        def thin(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
+            return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, thinned(v, bit), p["loss"]))
 
         effects.append(
             Effect(
@@ -74,14 +68,9 @@ def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
         )
     ]
     for device in range(clusters.devices):
-        cluster = int(clusters.cluster_of[device])
-        bit = int(clusters.weight[cluster, device])
 
-        def add(
-            value: Any, p: Mapping[str, Any], _: Mapping[str, Any], cluster: int = cluster, bit: int = bit
-        ) -> Any:
-            own = at(cluster, value.shape[2])[:, None]
-            return jnp.where(own, mix(value, joined(value, bit), p["extra"]), value)
+        def add(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
+            return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, joined(v, bit), p["extra"]))
 
         effects.append(
             Effect(

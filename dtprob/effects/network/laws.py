@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import jax
@@ -102,6 +102,25 @@ def at(index: int, size: int) -> Bool[np.ndarray, " n"]:
     return np.arange(size) == index
 
 
+def in_cluster_of(
+    logits: Float[Array, "*batch cluster outcome"],
+    clusters: ClustersLike,
+    device: int,
+    change: Callable[[Float[Array, "*batch cluster outcome"], int], Float[Array, "*batch cluster outcome"]],
+) -> Float[Array, "*batch cluster outcome"]:
+    """Logits of all clusters' arrivals, changed in the one that a device belongs to.
+
+    Args:
+        logits: of the joint arrivals of each cluster.
+        clusters: of the network.
+        device: whose cluster changes.
+        change: logits and the binary digit of the device in the number of an outcome -> new logits.
+    """
+    cluster = int(clusters.cluster_of[device])
+    changed = change(logits, int(clusters.weight[cluster, device]))
+    return jnp.where(at(cluster, logits.shape[-2])[:, None], changed, logits)
+
+
 def of_device(
     logits: Float[Array, "*batch cluster outcome"], clusters: ClustersLike, device: int, log_odds: Any
 ) -> Float[Array, "*batch cluster outcome"]:
@@ -113,9 +132,7 @@ def of_device(
         device: whose odds change.
         log_odds: logarithm of the factor, broadcasting to (*batch, cluster).
     """
-    cluster = int(clusters.cluster_of[device])
-    moved = tilted(logits, int(clusters.weight[cluster, device]), log_odds)
-    return jnp.where(at(cluster, logits.shape[-2])[:, None], moved, logits)
+    return in_cluster_of(logits, clusters, device, lambda value, bit: tilted(value, bit, log_odds))
 
 
 def last_arrival(
