@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import itertools
-from typing import Final, cast
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple, cast
 
 import equinox as eqx
 import numpy as np
@@ -24,55 +26,102 @@ _LONGEST: Final = 24
 _TURNS: Final = 24
 """Times that a cycle has to come round: sums of a few entries are far from normal."""
 
-type Curve = np.ndarray | sparse.csr_matrix
-type Curves = dict[str, Curve]
+
+class Ripple(NamedTuple):
+    """What a band of ripples is along.
+
+    Attributes:
+        over: an axis or a column.
+        lowest: half waves of the first curve; each of the next has one more.
+    """
+
+    over: str
+    lowest: int
 
 
-def extent(curve: Curve) -> tuple[int, int]:
-    """How many weights curves have, and along how many positions they run."""
-    weights, size = cast("tuple[int, int]", curve.shape)
-    return weights, size
+@dataclass(frozen=True)
+class Curves:
+    """Ways to vary along an axis, each with a weight of its own.
+
+    Attributes:
+        label: how, in words.
+        values: (weight, position).
+        ripple: of a band of ripples, what they are along.
+        column: of groups of positions, the column of the data that makes them.
+    """
+
+    label: str
+    values: np.ndarray | sparse.csr_matrix
+    ripple: Ripple | None = None
+    column: str | None = None
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """How many weights there are, and along how many positions they run."""
+        weights, size = cast("tuple[int, int]", self.values.shape)
+        return weights, size
+
+    def band(self, first: int, stop: int) -> Curves:
+        """The curves of a ripple from one to another, that one left out.
+
+        Raises:
+            ValueError: these are no ripples.
+        """
+        if self.ripple is None:
+            raise ValueError(f"{self.label} is no ripple, and has no bands")
+        return _ripple(self.ripple.over, self.ripple.lowest + first, np.asarray(self.values[first:stop]))
 
 
-def curves(problem: Problem, axis: str, size: int) -> Curves:
-    """Curves (curve, size) along an axis by family name; none where the axis is short."""
+def curves(problem: Problem, axis: str, size: int) -> tuple[Curves, ...]:
+    """All curves along an axis of some positions, each label once; none where the axis is short."""
     if size < _SMOOTH_FROM:
-        return {}
+        return ()
+    # ripples over a column of the axis's name are those over its positions, at their true places
+    return tuple({found.label: found for found in _curves(problem, axis, size)}.values())
+
+
+def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     place = (np.arange(size) + 0.5) / size
-    found = {f"smooth in {axis}": _waves(place, 1, _ORDER), **_ripples(axis, place)}
+    yield Curves(f"smooth in {axis}", _waves(place, 1, _ORDER))
+    yield from _ripples(axis, place)
     columns = _columns(problem, axis, size)
     for name, column in columns.items():
         groups, index = np.unique(column, return_inverse=True)
         if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
-            found[f"along {name}"] = _waves(_rank(column), 1, _ORDER)
-            found |= _ripples(name, (column - column.min()) / np.ptp(column))
+            yield Curves(f"along {name}", _waves(_rank(column), 1, _ORDER))
+            yield from _ripples(name, (column - column.min()) / np.ptp(column))
         else:
-            found[f"by {name}"] = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
+            grouped = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
+            yield Curves(f"by {name}", grouped, column=name)
     smooth = [name for name, column in columns.items() if np.issubdtype(column.dtype, np.floating)]
     for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
         crossed = _waves(_rank(columns[one]), 1, _CROSSED), _waves(_rank(columns[other]), 1, _CROSSED)
         products = crossed[0][:, None] * crossed[1][None]
-        found[f"over {one} and {other}"] = products.reshape(-1, size)
-    return found
+        yield Curves(f"over {one} and {other}", products.reshape(-1, size))
 
 
-def cycles(size: int) -> dict[int, sparse.csr_matrix]:
-    """For each period, the phases (phase, size) of an axis at which something may repeat; none where it is short."""
+def cycles(size: int, over: str) -> tuple[Curves, ...]:
+    """For each period, the phases at which something may repeat along axes of some positions; none where they are short."""
     place = np.arange(size)
-    return {
-        period: sparse.csr_matrix((np.ones(size), (place % period, place)))
+    return tuple(
+        Curves(f"every {period} along {over}", sparse.csr_matrix((np.ones(size), (place % period, place))))
         for period in range(2, min(_LONGEST, size // _TURNS) + 1)
-    }
+    )
 
 
-def _ripples(name: str, place: np.ndarray) -> Curves:
-    """Octaves of ripples over places (size,) in (0, 1), by family name."""
-    found, low, finest = {}, _ORDER + 1, min(len(place) - 1, _FINEST)
+def _ripples(over: str, place: np.ndarray) -> Iterator[Curves]:
+    """Octaves of ripples over places (size,) in (0, 1)."""
+    low, finest = _ORDER + 1, min(len(place) - 1, _FINEST)
     while low <= finest:
         high = min(2 * (low - 1), finest)
-        found[f"ripple in {name}, {low} to {high} half waves"] = _waves(place, low, high)
+        yield _ripple(over, low, _waves(place, low, high))
         low = high + 1
-    return found
+
+
+def _ripple(over: str, low: int, values: np.ndarray) -> Curves:
+    """Ripples of `low` half waves and more, one after another."""
+    label = f"ripple in {over}, {low} to {low + len(values) - 1} half waves"
+    return Curves(label, values, ripple=Ripple(over, low))
 
 
 def _waves(place: np.ndarray, low: int, high: int) -> np.ndarray:

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.gap.curves import Curve, Curves, cycles, extent
+from dtprob.gap.curves import Curves, cycles
 from dtprob.gap.problem import Problem
 
 _ROWS: Final = 8
@@ -23,7 +23,7 @@ _ROWS: Final = 8
 _COLUMNS: Final = 16
 """Entries beside the rows up to which each is looked at."""
 
-type Along = Callable[[str, int], Curves]
+type Along = Callable[[str, int], Sequence[Curves]]
 
 
 @dataclass(frozen=True)
@@ -33,27 +33,27 @@ class Pattern:
     Attributes:
         label: how it varies, in words.
         kept: axes of the site along which it varies.
-        curves: (weight, size of the first kept axes together), each position of the others having weights of its own;
-            None for a weight of its own at every position.
+        curves: along the first kept axes together, each position of the others having weights of its own; None for a
+            weight of its own at every position.
     """
 
     label: str
     kept: tuple[int, ...]
-    curves: Curve | None = None
+    curves: Curves | None = None
 
     def scores(self, summed: np.ndarray) -> np.ndarray:
         """Scores (n, weights) of the weights from those of the entries (n, *kept, part), other axes summed over."""
         if self.curves is None:
             return summed.reshape(len(summed), -1)
-        n, (_, size) = len(summed), extent(self.curves)
-        mixed = self.curves @ np.moveaxis(summed.reshape(n, size, -1), 1, 0).reshape(size, -1)
+        n, (_, size) = len(summed), self.curves.extent
+        mixed = self.curves.values @ np.moveaxis(summed.reshape(n, size, -1), 1, 0).reshape(size, -1)
         return np.moveaxis(mixed.reshape(mixed.shape[0], n, -1), 0, 1).reshape(n, -1)
 
     def perturbation(self, weights: np.ndarray, shape: Sequence[int], parts: int) -> np.ndarray:
         """The entries (*site, part) that weights stand for; broadcasts to the site's shape."""
-        along = (
-            weights if self.curves is None else self.curves.T @ weights.reshape(extent(self.curves)[0], -1)
-        )
+        along = weights
+        if self.curves is not None:
+            along = self.curves.values.T @ weights.reshape(self.curves.extent[0], -1)
         return along.reshape(*(n if i in self.kept else 1 for i, n in enumerate(shape)), parts)
 
 
@@ -182,8 +182,8 @@ def _patterns(along: Along, site: Site) -> Iterator[Pattern]:
     for kept in _kept_axes(site.value.shape):
         yield Pattern(" x ".join(site.axes[i] for i in kept) or "common", kept)
     for i, axis in enumerate(site.axes):
-        for label, curve in along(axis, site.value.shape[i]).items():
-            yield Pattern(label, (i,), curve)
+        for found in along(axis, site.value.shape[i]):
+            yield Pattern(found.label, (i,), found)
     yield from _cycles(site)
 
 
@@ -191,11 +191,11 @@ def _cycles(site: Site) -> Iterator[Pattern]:
     """What repeats along an axis, or along the rows of all clusters in their order, entry by entry of the other axes."""
     shape, kept = site.value.shape, tuple(range(site.value.ndim))
     for i, axis in enumerate(site.axes):
-        for period, curve in cycles(shape[i]).items():
-            yield Pattern(f"every {period} along {axis}", (i,), curve)
+        for found in cycles(shape[i], axis):
+            yield Pattern(found.label, (i,), found)
     if len(shape) > 1 and shape[1] >= _ROWS and np.prod(shape[2:]) <= _COLUMNS:
-        for period, curve in cycles(shape[0] * shape[1]).items():
-            yield Pattern(f"every {period} along {site.axes[0]} and {site.axes[1]}", kept, curve)
+        for found in cycles(shape[0] * shape[1], f"{site.axes[0]} and {site.axes[1]}"):
+            yield Pattern(found.label, kept, found)
 
 
 def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:

@@ -22,10 +22,9 @@ from dtprob.gap import closed, whiten
 from dtprob.gap import fit as fitting
 from dtprob.gap.calibration import Calibration, calibration
 from dtprob.gap.closed import ClosedFraction, Fold, HeldOut
-from dtprob.gap.curves import extent
 from dtprob.gap.problem import Problem
+from dtprob.gap.suspects import Suspect
 from dtprob.gap.view import View
-from dtprob.gap.where import Suspect
 
 _TRIED, _TAKEN = 6, 3
 """Families that are tried, and modelled together, at most."""
@@ -177,7 +176,7 @@ def _field_shape(problem: Problem, suspect: Suspect) -> tuple[int, ...]:
     shape, parts, pattern = _shape(problem, suspect), _parts(suspect, problem), suspect.family.pattern
     if pattern.curves is None:
         return (*(n if i in pattern.kept else 1 for i, n in enumerate(shape)), parts)
-    count, size = extent(pattern.curves)
+    count, size = pattern.curves.extent
     each = int(np.prod([shape[i] for i in pattern.kept])) // size * parts
     return (count, each) if _is_by_cluster(problem, suspect) else (*(1 for _ in shape), count, each)
 
@@ -188,10 +187,10 @@ def _size(problem: Problem, suspect: Suspect) -> int:
 
 def _is_by_cluster(problem: Problem, suspect: Suspect) -> bool:
     """Whether there is a curve for each cluster that a column of the data names."""
-    pattern = suspect.family.pattern
-    if pattern.curves is None or pattern.label != f"by {problem.cluster_name}":
-        return False
-    return extent(pattern.curves)[0] == problem.n_cluster
+    curves = suspect.family.pattern.curves
+    return (
+        curves is not None and curves.column == problem.cluster_name and curves.extent[0] == problem.n_cluster
+    )
 
 
 def _is_per_cluster(problem: Problem, suspect: Suspect) -> bool:
@@ -246,11 +245,12 @@ def _step(suspect: Suspect, shape: tuple[int, ...], parts: int) -> Callable[[Any
     pattern, factor, spread = suspect.family.pattern, jnp.asarray(suspect.family.factor), suspect.spread
     kept = tuple(n if i in pattern.kept else 1 for i, n in enumerate(shape))
     curves = pattern.curves
-    groups = curves.tocsc().indices if isinstance(curves, sparse.csr_matrix) else None
-    dense = jnp.asarray(curves) if isinstance(curves, np.ndarray) else None
+    values = None if curves is None else curves.values
+    groups = values.tocsc().indices if isinstance(values, sparse.csr_matrix) else None
+    dense = jnp.asarray(values) if isinstance(values, np.ndarray) else None
 
     def step(weights: Any) -> jax.Array:
-        pair = spread * (weights if curves is None else weights.reshape(extent(curves)[0], -1))
+        pair = spread * (weights if curves is None else weights.reshape(curves.extent[0], -1))
         along = pair if curves is None else pair[groups] if dense is None else dense.T @ pair
         along = along.reshape(*kept, parts)
         return factor * (along[..., 0] if parts == 1 else along[..., 0] + 1j * along[..., 1])

@@ -10,27 +10,22 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.bootstrap import Replicates
 from dtprob.gap.curves import curves
-from dtprob.gap.families import Family, Site, deterministic, families, observed, shifted
-from dtprob.gap.fields import common_spread, spread_terms
+from dtprob.gap.families import Site, deterministic, families, observed, shifted
+from dtprob.gap.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
-from dtprob.gap.tails import family_wise, gamma_tail, variance_ratio_tail
+from dtprob.gap.suspects import Suspect, suspects
+from dtprob.gap.tails import family_wise, gamma_tail
 
 _SURE = 0.005
 """Probability below which a site is surely wrong."""
-_CHANCE = 8
-"""Replicates that tell what a site would gain by chance."""
-_MOST_SUSPECTS = 12
-_MOST_WEIGHTS = 4096
-"""Suspects of a site that are kept, and weights that one of them may have."""
 
 
 @dataclass(frozen=True)
@@ -71,25 +66,6 @@ class CoordinateFinding:
 
 
 @dataclass(frozen=True)
-class Suspect:
-    """A way of varying a surely wrong site, with random weights of a common spread.
-
-    Attributes:
-        site: its name.
-        rows: of an observation, its whitened components that move; None for a deterministic site.
-        family: what is added to the site, and how it varies.
-        spread: standard deviation of the weights with the largest evidence.
-        evidence: log Bayes factor of that spread against none, to first order, each weight apart.
-    """
-
-    site: str
-    rows: tuple[int, ...] | None
-    family: Family
-    spread: float
-    evidence: float
-
-
-@dataclass(frozen=True)
 class Location:
     """Maps of the gap at one fit; the suspects come in order of falling evidence.
 
@@ -111,7 +87,7 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
     found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
     found += observed(problem, jnp.concatenate([drawn.observed[None], drawn.projected]))
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    tested = [[_family_test(*family) for family in families(along, site)] for site in found]
+    tested = [[family_test(*family) for family in families(along, site)] for site in found]
     null = [test.null for tests in tested for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
     findings = [
@@ -125,14 +101,14 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
         s
         for site, tests in zip(found, tested, strict=True)
         if site.name in sure
-        for s in _suspects(site, tests)
+        for s in suspects(site, tests)
     ]
-    suspects = tuple(sorted(named, key=lambda s: -s.evidence))
+    suspected = tuple(sorted(named, key=lambda s: -s.evidence))
     entries = {site.name: e for site, tests in zip(found, tested, strict=True) for e in _entries(site, tests)}
-    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0), suspects, entries)
+    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0), suspected, entries)
 
 
-def _entries(site: Site, tests: Sequence[_Test]) -> Iterator[np.ndarray]:
+def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
     """The map over the entries of a site of several axes."""
     wide = tuple(i for i, n in enumerate(site.value.shape) if n > 1)
     for test in tests if len(wide) > 1 else ():
@@ -146,91 +122,10 @@ def _entries(site: Site, tests: Sequence[_Test]) -> Iterator[np.ndarray]:
             yield gain.reshape(*site.value.shape, -1).sum(-1)
 
 
-def _suspects(site: Site, tests: Sequence[_Test]) -> list[Suspect]:
-    """The families of a site that have the most evidence, ripples also narrowed to the half waves that bring it."""
-    whole = [test for test in tests if test.variance.size <= _MOST_WEIGHTS]
-    found = [_suspect(site, test) for test in whole]
-    found += [_suspect(site, narrow, price) for test in whole for narrow, price in _narrowed(test)]
-    return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
-
-
-def _narrowed(test: _Test) -> Iterator[tuple[_Test, float]]:
-    """The ripple's band of 1, 2, 4 ... half waves with the most evidence, and the logarithm of how many there were."""
-    pattern = test.family.pattern
-    if not pattern.label.startswith("ripple") or not isinstance(pattern.curves, np.ndarray):
-        return
-    name, _, band = pattern.label.partition(", ")
-    low, count = int(band.split()[0]), len(pattern.curves)
-    if count == 1:
-        return
-    _, terms = spread_terms(test.first[0], test.variance)
-    summed = np.cumsum(terms.reshape(len(terms), count, -1).sum(-1), axis=1)
-    summed = np.concatenate([np.zeros((len(terms), 1)), summed], axis=1)
-    lengths = 2 ** np.arange(int(np.log2(count)))
-    tops = [(summed[:, n:] - summed[:, :-n]).max(axis=0) for n in lengths]
-    top = max(range(len(tops)), key=lambda i: tops[i].max())
-    first = int(tops[top].argmax())
-    best = first, first + int(lengths[top])
-    label = f"{name}, {low + best[0]} to {low + best[1] - 1} half waves"
-    narrow = replace(test.family, pattern=replace(pattern, label=label, curves=pattern.curves[slice(*best)]))
-    parts = len(test.variance) // count
-    own = slice(best[0] * parts, best[1] * parts)
-    chances = sum(map(len, tops))
-    yield (
-        test._replace(family=narrow, first=test.first[:, own], variance=test.variance[own]),
-        float(np.log(chances)),
-    )
-
-
-def _suspect(site: Site, test: _Test, price: float = 0.0) -> Suspect | None:
-    """A tested family as a suspect, if its evidence less its price speaks for it."""
-    spread, evidence = common_spread(test.first[0], test.variance)
-    evidence -= price
-    return Suspect(site.name, site.rows, test.family, spread, evidence) if evidence > 0 else None
-
-
 def _spreads_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
     spread = [f.family.startswith("spread") for f in findings]
     sure = any(f.p_value <= _SURE and not s for f, s in zip(findings, spread, strict=True))
     return [replace(f, last=sure and s) for f, s in zip(findings, spread, strict=True)]
-
-
-class _Test(NamedTuple):
-    """A site family's test.
-
-    Attributes:
-        family: what was tested.
-        p_value: of the data.
-        null: p-value of each replicate.
-        first: scores (1 + _CHANCE, entry) of the data and of the first replicates.
-        variance: of the scores, (entry,).
-    """
-
-    family: Family
-    p_value: float
-    null: np.ndarray
-    first: np.ndarray
-    variance: np.ndarray
-
-
-def _family_test(family: Family, scores: np.ndarray) -> _Test:
-    """Test a family's summed squared scores (1 + replicate, entry), each entry scaled by its null variance."""
-    first, n = scores[: 1 + _CHANCE].copy(), len(scores) - 1
-    given, null = scores[0], scores[1:]
-    total = (null**2).sum(0)
-    variance = total / n
-    alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
-    if not alive.any():
-        return _Test(family, 1.0, np.ones(n), first, variance)
-    null, given, total = null[:, alive], given[alive], total[alive]
-    left_out = (total - null**2) / (n - 1)
-    known = left_out > 1e-9 * total / n  # rare outcomes move an entry in one replicate and in no other
-    statistic = (np.where(known, null**2, 0.0) / np.where(known, left_out, 1.0)).sum(1)
-    value = float((given**2 / (total / n)).sum())
-    p = variance_ratio_tail(
-        np.append(statistic, value), float(statistic.mean()), float(statistic.var()), n - 1
-    )
-    return _Test(family, float(p[-1]), p[:-1], first, variance)
 
 
 def _finding(
@@ -240,14 +135,14 @@ def _finding(
     drawn: Replicates,
     *,
     site: Site,
-    tests: Sequence[_Test],
+    tests: Sequence[FamilyTest],
     smallest: np.ndarray,
 ) -> SiteFinding:
     """The family of a site with the smallest p-value, with the gain along its steepest direction."""
     best = min(tests, key=lambda test: (test.p_value, -float((test.first[0] ** 2).sum())))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
-    rows = jnp.concatenate([drawn.observed[None], drawn.projected[:_CHANCE]])
+    rows = jnp.concatenate([drawn.observed[None], drawn.projected[:CHANCE]])
     slope = np.asarray(jnp.einsum("ncm,ncm->n", shifts, rows))
     curvature = np.asarray(jnp.einsum("ncm,ncm->n", shifts, shifts))
     gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)

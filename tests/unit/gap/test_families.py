@@ -80,25 +80,49 @@ def test_a_neighbour_leaks_into_an_entry(problem):
 
 
 def test_curves_are_smooth_ripples_columns_and_groups(problem):
-    found = curves(problem, "row", LENGTH)
-    ripples = [name for name in found if name.startswith("ripple in row")]
-    waves = np.concatenate([found["smooth in row"], *(found[n] for n in ripples)])
+    given = curves(problem, "row", LENGTH)
+    found = {c.label: c.values for c in given}
+    ripples = [c.values for c in given if c.ripple is not None and c.ripple.over == "row"]
+    waves = np.concatenate([found["smooth in row"], *ripples])
     np.testing.assert_allclose(waves @ waves.T, LENGTH / 2 * np.eye(LENGTH - 1), atol=1e-9)
     assert found["by street"].shape == (5, LENGTH)
     np.testing.assert_array_equal(found["by street"].toarray().sum(0), 1.0)
     assert {"along x", "along place[0]", "along place[1]", "over place[0] and place[1]"} <= set(found)
+    assert {c.label: c.column for c in given if c.column is not None} == {"by street": "street"}
     assert not any("y" in name.split()[1:] for name in found)
     order = np.argsort(np.asarray(problem.data["x"]))
     assert np.all(np.diff(found["along x"][0][order]) < 0)
 
 
+def test_a_band_of_ripples_is_called_by_its_half_waves(problem):
+    found = {c.label: c for c in curves(problem, "row", LENGTH)}
+    whole = found["ripple in row, 9 to 16 half waves"]
+    band = whole.band(2, 5)
+    assert band.label == "ripple in row, 11 to 13 half waves"
+    np.testing.assert_array_equal(band.values, whole.values[2:5])
+    assert band.band(1, 2).label == "ripple in row, 12 to 12 half waves"
+    with pytest.raises(ValueError, match="no ripple"):
+        found["smooth in row"].band(0, 1)
+
+
+def test_a_column_of_an_axis_name_stands_for_its_positions(problem):
+    place = np.random.default_rng(5).uniform(size=LENGTH)
+    named = SimpleNamespace(declaration=problem.declaration, data={**problem.data, "row": place})
+    labels = [c.label for c in curves(named, "row", LENGTH)]
+    assert len(labels) == len(set(labels))
+    ripple = next(c for c in curves(named, "row", LENGTH) if c.ripple is not None)
+    scaled = (place - place.min()) / np.ptp(place)
+    np.testing.assert_allclose(ripple.values[0], np.cos(5 * np.pi * scaled), atol=1e-12)
+
+
 def test_cycles_of_each_period_take_turns():
-    found = cycles(150)
-    assert list(found) == [2, 3, 4, 5, 6]
-    for period, phases in found.items():
-        np.testing.assert_array_equal(phases.toarray().argmax(0), np.arange(150) % period)
-        np.testing.assert_array_equal(phases.toarray().sum(0), 1.0)
-    assert cycles(47) == {}
+    found = cycles(150, "slot")
+    assert [c.label for c in found] == [f"every {period} along slot" for period in range(2, 7)]
+    for period, one in enumerate(found, start=2):
+        phases = one.values.toarray()
+        np.testing.assert_array_equal(phases.argmax(0), np.arange(150) % period)
+        np.testing.assert_array_equal(phases.sum(0), 1.0)
+    assert cycles(47, "slot") == ()
 
 
 def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
@@ -113,7 +137,7 @@ def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
 
 
 def test_short_axes_have_no_curves(problem):
-    assert curves(problem, "antenna", 5) == {}
+    assert curves(problem, "antenna", 5) == ()
 
 
 def test_the_spread_of_an_observation_is_a_site(problem):

@@ -1,6 +1,5 @@
 """The remainder at its site: against exact regression, calibrated in simulation, honest where nothing carries over."""
 
-from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -13,7 +12,7 @@ import pytest
 from scipy import stats
 
 from dtprob.effects.effect import FIELD
-from dtprob.gap import closed, where
+from dtprob.gap import closed
 from dtprob.gap import fit as fitting
 from dtprob.gap.calibration import calibration
 from dtprob.gap.curves import curves
@@ -21,7 +20,7 @@ from dtprob.gap.families import Family, Pattern, deterministic, families
 from dtprob.gap.fields import common_spread
 from dtprob.gap.problem import Problem
 from dtprob.gap.remainder import field_of, model_remainder, shortlist
-from dtprob.gap.where import Suspect
+from dtprob.gap.suspects import Suspect
 
 SIGMA = 0.5
 N_ROW = 240
@@ -62,7 +61,7 @@ def rows(seed, shift=0.0, loudness=1.0, streets=24):
 def suspect(problem, label, spread=1.0, *, site="mean", kind="additive", evidence=50.0):
     """The family of a label."""
     rows = {"location": (0,), "spread": (1,)}.get(kind)
-    pattern = Pattern(label, (0,), curves(problem, "row", N_ROW)[label])
+    pattern = Pattern(label, (0,), next(c for c in curves(problem, "row", N_ROW) if c.label == label))
     return Suspect(site, rows, Family(kind, pattern, np.ones(())), spread, evidence)
 
 
@@ -115,7 +114,7 @@ def test_a_field_along_a_curve_is_exact_normal_regression():
     kept = np.ones(problem.n_cluster)
     kept[:6] = 0.0
     found = fitting.fit(wider, wider.null(), ["r[0]"], weights=kept)
-    data, curve = problem.data, 0.3 * one.family.pattern.curves.T
+    data, curve = problem.data, 0.3 * one.family.pattern.curves.values.T
     seen = data["street"] >= 6
     spread = found.spread["r[0]"]
 
@@ -230,32 +229,3 @@ def test_predictions_of_a_right_model_are_calibrated():
     found = calibration(problem, parts)
     assert found.coverage == pytest.approx(0.9, abs=3.5 * np.sqrt(0.09 / N_ROW))
     assert found.error_ratio == pytest.approx(1.0, abs=3.5 / np.sqrt(2 * N_ROW))
-
-
-def test_a_ripple_is_narrowed_to_the_half_waves_that_bring_the_evidence():
-    """Of 32 scores of unit variance one is 8: its band alone has more evidence than all together."""
-    problem = prepared(rows(5))[0]
-    family = suspect(problem, "ripple in row, 33 to 64 half waves").family
-    scores = np.random.default_rng(0).normal(size=(9, 32))
-    scores[0, 5] = 8.0
-    test = where._Test(family, 0.0, np.ones(9), scores, np.ones(32))
-    site = SimpleNamespace(name="mean", rows=None)
-    found = where._suspects(site, [test])
-    assert [s.family.pattern.label for s in found] == [
-        "ripple in row, 38 to 38 half waves",
-        "ripple in row, 33 to 64 half waves",
-    ]
-    np.testing.assert_array_equal(found[0].family.pattern.curves, family.pattern.curves[5:6])
-    exact = 0.5 * (64 - 1 - np.log(64)) - np.log(32 + 31 + 29 + 25 + 17)
-    assert found[0].evidence == pytest.approx(exact, abs=0.1)
-
-
-def test_a_band_of_one_half_wave_is_left_as_it_is():
-    problem = prepared(rows(5))[0]
-    family = suspect(problem, "ripple in row, 33 to 64 half waves").family
-    one = replace(
-        family.pattern, label="ripple in row, 33 to 33 half waves", curves=family.pattern.curves[:1]
-    )
-    test = where._Test(replace(family, pattern=one), 0.0, np.ones(9), np.full((9, 1), 5.0), np.ones(1))
-    found = where._suspects(SimpleNamespace(name="mean", rows=None), [test])
-    assert [s.family.pattern.label for s in found] == [one.label]
