@@ -57,8 +57,13 @@ def rates[T](
     for name, test in tests.items():
         outcomes = [outcome for subject in subjects for outcome in test(subject)]
         if outcomes:
-            found[name] = Rate(sum(outcomes), len(outcomes)).to_dict()
+            found[name] = rate(outcomes)
     return found
+
+
+def rate(outcomes: Sequence[bool]) -> dict[str, Any]:
+    """The share of some outcomes, at least one, that are true; see `Rate`."""
+    return Rate(sum(outcomes), len(outcomes)).to_dict()
 
 
 def median(values: Sequence[float]) -> dict[str, Any]:

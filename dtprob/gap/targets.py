@@ -2,33 +2,37 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 from dtprob.gap.answers import Answer
-from dtprob.gap.rates import median, over_limit, rates, ratio
+from dtprob.gap.rates import median, over_limit, rate, ratio
 
 SINGLE: Final = ("listed", "alias")
 SETS: Final = ("pair", "triple")
 
 
 class Target(NamedTuple):
-    """A share that is to lie within limits.
+    """A number over some cases that is to lie within limits.
 
     Attributes:
-        name: what is counted.
+        name: what it is.
         kinds: of cases.
-        from_lambda: of cases with effects at least this informative.
-        test: outcomes of an answer.
-        lowest, highest: the limits.
+        from_lambda: cases with effects at least this informative.
+        values: what an answer adds to it.
+        lowest, highest: the limits; None where there is none on that side.
+        summary: of all that answers add: a value with its interval.
+        to_lambda: cases with effects at most this informative.
     """
 
     name: str
     kinds: Sequence[str]
     from_lambda: float
-    test: Callable[[Answer], Iterable[bool]]
-    lowest: float
-    highest: float
+    values: Callable[[Answer], Sequence[Any]]
+    lowest: float | None
+    highest: float | None
+    summary: Callable[[Sequence[Any]], dict[str, Any]] = rate
+    to_lambda: float = float("inf")
 
 
 NOT_IMITATED: Final = 64.0
@@ -41,6 +45,18 @@ def _resolved(answer: Answer) -> list[bool]:
 
 def _called(answer: Answer) -> list[bool]:
     return [answer.is_unlisted] if answer.unexplained >= NOT_IMITATED else []
+
+
+def _named(answer: Answer) -> Sequence[tuple[float, float]]:
+    return answer.over_limit(lambda limit: limit.named)
+
+
+def _cells(answer: Answer) -> Sequence[tuple[float, float]]:
+    return [(score, 1.0) for score in answer.cell_scores()]
+
+
+def _seconds(answer: Answer) -> Sequence[float]:
+    return [] if answer.seconds is None else [answer.seconds]
 
 
 TARGETS: Final = (
@@ -61,119 +77,63 @@ TARGETS: Final = (
     Target("closed fraction in its 90% interval", (*SINGLE, *SETS), 0.0, Answer.covered_fraction, 0.88, 0.93),
     Target("closed fraction of .98 or more", (*SINGLE, *SETS), 100.0, Answer.closes(0.98), 0.5, 1.0),
     Target("closed fraction of .90 or more", (*SINGLE, *SETS), 100.0, Answer.closes(0.90), 0.9, 1.0),
-)
-"""From which lambda on, and which share; a median of .98 is half of the cases at .98 or more."""
-
-
-class Quantity(NamedTuple):
-    """A number over some cases that is to lie within limits.
-
-    Attributes:
-        name: what it is.
-        kinds: of cases.
-        from_lambda, to_lambda: how informative their effects are.
-        values: what an answer adds to it.
-        summary: of all that answers add: a value with its interval.
-        lowest, highest: the limits; None where there is none on that side.
-    """
-
-    name: str
-    kinds: Sequence[str]
-    from_lambda: float
-    to_lambda: float
-    values: Callable[[Answer], Sequence[Any]]
-    summary: Callable[[Sequence[Any]], dict[str, Any]]
-    lowest: float | None
-    highest: float | None
-
-
-def _named(answer: Answer) -> Sequence[tuple[float, float]]:
-    return answer.over_limit(lambda limit: limit.named)
-
-
-def _cells(answer: Answer) -> Sequence[tuple[float, float]]:
-    return [(score, 1.0) for score in answer.cell_scores()]
-
-
-_MANY: Final = float("inf")
-QUANTITIES: Final = (
     *(
-        Quantity(
+        Target(
             f"right effect first over the best possible, lambda {size:g}",
             SINGLE,
             size,
-            size,
             _named,
-            over_limit,
             0.97,
             None,
+            over_limit,
+            to_lambda=size,
         )
         for size in (10.0, 25.0, 50.0)
     ),
-    Quantity(
+    Target(
         "right effect first by its score over the best possible",
         SINGLE,
         10.0,
-        50.0,
         Answer.screened_over_limit,
-        over_limit,
         0.97,
         None,
+        over_limit,
+        to_lambda=50.0,
     ),
-    Quantity(
-        "size of the class over the best possible",
-        SINGLE,
-        50.0,
-        _MANY,
-        Answer.class_over_limit,
-        ratio,
-        None,
-        1.2,
+    Target(
+        "size of the class over the best possible", SINGLE, 50.0, Answer.class_over_limit, None, 1.2, ratio
     ),
-    Quantity(
-        "F1 of the cells touched", (*SINGLE, *SETS, "unlisted"), 100.0, _MANY, _cells, ratio, 0.85, None
-    ),
-    Quantity(
+    Target("F1 of the cells touched", (*SINGLE, *SETS, "unlisted"), 100.0, _cells, 0.85, None, ratio),
+    Target(
         "width of the closed fraction's interval",
         (*SINGLE, *SETS),
         100.0,
-        100.0,
         Answer.width,
-        median,
         None,
         0.3,
+        median,
+        to_lambda=100.0,
     ),
-    Quantity(
-        "the same where more can be told", (*SINGLE, *SETS), 400.0, _MANY, Answer.width, median, None, 0.1
-    ),
-    Quantity(
+    Target("the same where more can be told", (*SINGLE, *SETS), 400.0, Answer.width, None, 0.1, median),
+    Target(
         "closed by the model of the remainder",
         ("unlisted",),
         0.0,
-        _MANY,
         Answer.remainder_closed,
-        median,
         0.75,
         None,
-    ),
-    Quantity(
-        "seconds of one case",
-        ("null", *SINGLE, *SETS, "unlisted"),
-        0.0,
-        _MANY,
-        lambda a: [] if a.seconds is None else [a.seconds],
         median,
-        None,
-        20.0,
     ),
+    Target("seconds of one case", ("null", *SINGLE, *SETS, "unlisted"), 0.0, _seconds, None, 20.0, median),
 )
-"""Seconds are those of the machine and the load that they were measured under."""
+"""From which lambda on, and which number; a median of .98 is half of the cases at .98 or more. Seconds are those of the
+machine and the load that they were measured under."""
 
 
 def against_targets(
     answers: Sequence[Answer], rivals: Mapping[str, Sequence[Answer]]
 ) -> list[dict[str, Any]]:
-    """Each target that the cases can tell of, with the share of the diagnosis and of each rival.
+    """Each target that the cases can tell of, with the number of the diagnosis and of each rival.
 
     Args:
         answers: of the diagnosis.
@@ -181,29 +141,18 @@ def against_targets(
     """
     lines = []
     for target in TARGETS:
-        share = _share(target, answers)
-        if share is not None:
-            theirs = {rival: _share(target, said) for rival, said in rivals.items()}
+        found = _reached(target, answers)
+        if found is not None:
+            theirs = {rival: _reached(target, said) for rival, said in rivals.items()}
             goal = {"lowest": target.lowest, "highest": target.highest}
             about = {"name": target.name, "from_lambda": target.from_lambda, "target": goal}
-            lines.append({**about, **share, "rivals": {n: s for n, s in theirs.items() if s is not None}})
-    for quantity in QUANTITIES:
-        value = _value(quantity, answers)
-        if value is not None:
-            theirs = {rival: _value(quantity, said) for rival, said in rivals.items()}
-            goal = {"lowest": quantity.lowest, "highest": quantity.highest}
-            about = {"name": quantity.name, "from_lambda": quantity.from_lambda, "target": goal}
-            lines.append({**about, **value, "rivals": {n: v for n, v in theirs.items() if v is not None}})
+            lines.append({**about, **found, "rivals": {n: r for n, r in theirs.items() if r is not None}})
     return lines
 
 
-def _value(quantity: Quantity, answers: Sequence[Answer]) -> dict[str, Any] | None:
-    asked = [a for a in answers if a.kind in quantity.kinds]
-    asked = [a for a in asked if quantity.from_lambda <= a.lambda_ <= quantity.to_lambda]
-    values = [value for answer in asked for value in quantity.values(answer)]
-    return quantity.summary(values) if values else None
-
-
-def _share(target: Target, answers: Sequence[Answer]) -> dict[str, Any] | None:
-    asked = [a for a in answers if a.kind in target.kinds and a.lambda_ >= target.from_lambda]
-    return rates({target.name: target.test}, asked).get(target.name)
+def _reached(target: Target, answers: Sequence[Answer]) -> dict[str, Any] | None:
+    """The number of a target; None where no answer adds to it."""
+    asked = [a for a in answers if a.kind in target.kinds]
+    asked = [a for a in asked if target.from_lambda <= a.lambda_ <= target.to_lambda]
+    values = [value for answer in asked for value in target.values(answer)]
+    return target.summary(values) if values else None
