@@ -22,6 +22,8 @@ from dtprob.gap.problem import Problem
 
 _SCALE_ROW: Final = {"ComplexNormal": 0.5, "Normal": 0.5**0.5, "LogNormal": 0.5**0.5}
 """Families whose whitened residuals are normal, and the logarithm of their scale for a unit step of their last row."""
+_OUTCOMES: Final = frozenset({"BernoulliLogits", "BernoulliProbs", "CategoricalLogits", "CategoricalProbs"})
+"""Families of which one of a few outcomes is seen."""
 _WIDEST: Final = 2.0
 """Log spread beyond which the noise's own spread is not followed."""
 _LEVEL: Final = 0.9
@@ -35,11 +37,14 @@ class Calibration:
 
     Attributes:
         coverage: share of observed entries inside their 90% predictive interval; None where entries are discrete.
-        error_ratio: root mean square of errors over predicted standard deviations, 1 if they are right.
+        error_ratio: root mean square of errors over predicted standard deviations, 1 if they are right; None where outcomes
+            are observed. The probability p of an outcome says how much it varies, p (1 - p), however uncertain p itself is:
+            outcomes one by one vary no more where a gap is, and no less than predicted once it is allowed for (McCullagh
+            and Nelder, Generalized Linear Models, 1989, section 4.4.5).
     """
 
     coverage: float | None
-    error_ratio: float
+    error_ratio: float | None
 
 
 def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
@@ -50,17 +55,18 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
         folds: which clusters were left out, and the fits to the others.
     """
     located = problem.rows.by_cluster(problem.rows.located) == 1
-    inside, squares, continuous = [], [], False
+    inside, squares = [], []
+    families: set[str] = set()
     for held, part in folds:
         predicted = _predicted(problem, part, held)
         seen = located[held] & (predicted.sd > _ABSORBED**0.5)
         scaled, swing = predicted.error[seen] / predicted.sd[seen], predicted.swing[seen]
         inside.append(np.abs(scaled) <= _reach(swing))
         squares.append(scaled**2 * np.exp(-2 * swing**2))
-        families = {o.family for o in problem.compiled.observations(part.x).values()}
-        continuous = families <= set(_SCALE_ROW)
-    coverage = float(np.concatenate(inside).mean()) if continuous else None
-    return Calibration(coverage, float(np.sqrt(np.concatenate(squares).mean())))
+        families |= {o.family for o in problem.compiled.observations(part.x).values()}
+    coverage = float(np.concatenate(inside).mean()) if families <= set(_SCALE_ROW) else None
+    ratio = None if families & _OUTCOMES else float(np.sqrt(np.concatenate(squares).mean()))
+    return Calibration(coverage, ratio)
 
 
 class _Predicted(NamedTuple):

@@ -129,10 +129,13 @@ class Term(TypedDict):
 
 
 class Calibration(TypedDict):
-    """On data left out: share inside the 90% predictive interval (null for discrete data), actual over predicted error."""
+    """On data left out: share inside the 90% predictive interval, actual over predicted error.
+
+    The first is null for discrete data, the second for outcomes of which there are a few, such as arrivals of packets.
+    """
 
     coverage: Probability | None
-    error_ratio: float
+    error_ratio: float | None
 
 
 class Remainder(TypedDict):

@@ -282,4 +282,10 @@ def test_the_remainder_is_told_with_its_calibration(examples: dict[str, Any]) ->
     assert re.search(r"inside their 90% interval 71% 90% 90%", page.text)
     assert any("Share of what is left" in (svg["aria-label"] or "") for svg in page.all("svg"))
     report["remainder"]["before"]["coverage"] = report["remainder"]["after"]["coverage"] = None
-    assert "inside their 90% interval" not in Page(render(report, None, title="x")).text
+    counts = Page(render(report, None, title="x")).text
+    assert "inside their 90% interval" not in counts
+    assert re.search(r"Actual error over predicted error 1\.6\d* 1\.01 1", counts)
+    report["remainder"]["before"]["error_ratio"] = report["remainder"]["after"]["error_ratio"] = None
+    outcomes = Page(render(report, None, title="x")).text
+    assert "What is left, modelled where it shows" in outcomes
+    assert "as uncertain as they say" not in outcomes

@@ -21,6 +21,7 @@ from dtprob.gap.fields import common_spread
 from dtprob.gap.problem import Problem
 from dtprob.gap.remainder import field_of, model_remainder, shortlist
 from dtprob.gap.suspects import Suspect
+from tests.unit.gap.examples import MODELS, draw, inputs
 
 SIGMA = 0.5
 N_ROW = 240
@@ -229,3 +230,19 @@ def test_predictions_of_a_right_model_are_calibrated():
     found = calibration(problem, parts)
     assert found.coverage == pytest.approx(0.9, abs=3.5 * np.sqrt(0.09 / N_ROW))
     assert found.error_ratio == pytest.approx(1.0, abs=3.5 / np.sqrt(2 * N_ROW))
+
+
+@pytest.mark.parametrize("name", ["counts", "logistic", "labels"])
+def test_errors_of_outcomes_are_not_judged(name):
+    """A level of each link's own: counts vary more with it, outcomes by p (1 - p) as before."""
+    x = inputs(0, 40)
+    level = np.random.default_rng(9).normal(size=(40, 1))
+    shift = level[..., None] * np.array([1.0, 0.0, 0.0]) if name == "labels" else level
+    problem = Problem(MODELS[name][0], draw(name, 1, shift, x), [])
+    fitted = fitting.fit(problem, problem.null())
+    found = calibration(problem, list(closed.fold_fits(problem, fitted, closed.folds(40, 2))))
+    assert found.coverage is None
+    if name == "counts":
+        assert found.error_ratio > 2
+    else:
+        assert found.error_ratio is None
