@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import jax
@@ -17,6 +17,8 @@ from dtprob.gap.settings import Settings
 
 _PORTION: Final = 50
 """Replicates that are held at once."""
+_MOST_VALUES: Final = 2e7
+"""Values of sites that further replicates may hold together."""
 
 
 @dataclass(frozen=True)
@@ -61,13 +63,36 @@ def replicate(
     keys = jax.random.split(key, settings.replicates)
     raw = projection.before_fit(problem.compiled.residual(fitted.x))
     observed = projection.rows(raw[None])[0]
-    parts = [
-        projection.rows(rows)
-        for rows, _ in _portions(problem, fitted, projection, keys[: settings.site_replicates])
-    ]
-    projected = jnp.concatenate(parts)
+    projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
     gradients = problem.compiled.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
     return Replicates(problem, fitted, projection, keys, raw, observed, projected, gradients)
+
+
+def more(drawn: Replicates, times: int) -> Replicates:
+    """As many times more replicates at the sites, all of them new; fewer where the sites are large.
+
+    Args:
+        drawn: a first look at the same fit.
+        times: how many more.
+    """
+    first = len(drawn.projected)
+    entries = sum(g[0].size for g in drawn.gradients.values())
+    times = int(np.clip(_MOST_VALUES / (first * max(entries, 1)), 1, times))
+    keys = jax.random.split(jax.random.fold_in(drawn.keys[0], times), times * first)
+    projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
+    gradient = drawn.problem.compiled.site_gradient
+    parts = [
+        gradient(drawn.fitted.x, jnp.concatenate([drawn.observed[None], projected[low : low + first]]))
+        for low in range(0, len(projected), first)  # of the shape that is compiled
+    ]
+    own = {n: g[:1] for n, g in drawn.gradients.items()}
+    gradients = {n: jnp.concatenate([g, *(part[n][1:] for part in parts)]) for n, g in own.items()}
+    return replace(drawn, projected=projected, gradients=gradients)
+
+
+def _projected(problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array) -> jax.Array:
+    parts = _portions(problem, fitted, projection, keys)
+    return jnp.concatenate([projection.rows(rows) for rows, _ in parts])
 
 
 def _portions(

@@ -5,16 +5,23 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
-from scipy import special, stats
+from scipy import special
 
 LOG_SMALLEST: Final = -660.0
 """Logarithms below this are not turned into probabilities."""
+_LEVELS: Final = np.array([0.005, 0.01, 0.02, 0.05, 0.1, 0.25, 0.5])
+_BELOW: Final = 4
+"""Replicates below a quantile that are enough to estimate it."""
 
 
 def family_wise(p: np.ndarray, replicate_p: np.ndarray) -> np.ndarray:
-    """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show."""
-    quantiles = np.quantile(np.maximum(replicate_p, 1e-300), [0.05, 0.1, 0.25, 0.5])
-    effective = np.log1p(-np.array([0.05, 0.1, 0.25, 0.5])) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
+    """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show.
+
+    Far out there may be more of them than near the middle, so the level is looked at too where there are the replicates.
+    """
+    told = _LEVELS[_LEVELS * len(replicate_p) >= _BELOW]
+    quantiles = np.quantile(np.maximum(replicate_p, 1e-300), told)
+    effective = np.log1p(-told) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
     m = float(np.clip(np.max(effective), 1.0, 1e6))
     return -np.expm1(m * np.log1p(-np.minimum(p, 1 - 1e-16)))
 
@@ -41,15 +48,15 @@ def variance_ratio_tail(observed: np.ndarray, mean: float, variance: float, repl
         replicates: from which the variance of each square was taken.
     """
     squares = 2 * mean**2 / max(variance, 1e-12 * mean**2)
-    log_p = stats.f.logsf(observed / mean, squares, replicates * max(squares, 1.0))
-    return np.exp(np.maximum(log_p, LOG_SMALLEST))
+    p = special.fdtrc(squares, replicates * max(squares, 1.0), observed / mean)
+    return np.maximum(p, np.exp(LOG_SMALLEST))
 
 
 def log_gamma_tail(value: np.ndarray, shape: np.ndarray | float) -> np.ndarray:
     """Log upper-tail probability of a unit gamma, by its asymptote where the probability underflows."""
-    log_p = stats.gamma.logsf(value, shape)
+    p = special.gammaincc(shape, value)
     far = (shape - 1) * np.log(np.maximum(value, 1e-300)) - value - special.gammaln(shape)
-    return np.where(np.isfinite(log_p), log_p, far)
+    return np.where(p > 0, np.log(np.where(p > 0, p, 1.0)), far)
 
 
 def field_log_bayes_factor(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
@@ -61,5 +68,4 @@ def field_log_bayes_factor(observed: np.ndarray, mean: np.ndarray, variance: np.
 
 def normal_quantile(log_p: np.ndarray) -> np.ndarray:
     """Normal quantile of an upper-tail probability given by its logarithm."""
-    far = np.sqrt(np.maximum(-2 * log_p - np.log(np.maximum(-4 * np.pi * log_p, 1e-12)), 0.0))
-    return np.where(log_p > LOG_SMALLEST, stats.norm.isf(np.exp(np.maximum(log_p, LOG_SMALLEST))), far)
+    return -special.ndtri_exp(log_p)

@@ -156,7 +156,7 @@ def _coordinates(
 ) -> tuple[tuple[CoordinateFinding, ...], dict[str, np.ndarray]]:
     """Energy of the whitened residuals over dyadic blocks of every axis, against its bootstrap distribution."""
     blocks: list[tuple[str, int, int]] = []
-    p, p_null, excess, maps = [], [], [], {}
+    p, excess, maps = [], [], {}
     located = problem.rows.by_cluster(problem.rows.located) == 1
     for axis, position in problem.rows.coordinates.items():
         index = np.where(located, problem.rows.by_cluster(position), -1)
@@ -166,20 +166,18 @@ def _coordinates(
         energy = np.stack([_energy(rows, index, size) for rows in (observed, *null)])
         maps[axis] = (energy[0] - energy[1:].mean(0)) / np.maximum(energy[1:].std(0), 1e-12)
         cumulative = np.concatenate([np.zeros((len(energy), 1)), np.cumsum(energy, axis=1)], axis=1)
-        for low, high in _windows(size, ordered=axis != problem.declaration.cluster):
-            inside = cumulative[:, high + 1] - cumulative[:, low]
-            mean, variance = np.asarray(inside[1:].mean()), np.asarray(inside[1:].var())
-            tail, _ = gamma_tail(inside, mean, variance)
-            blocks.append((axis, low, high))
-            p.append(tail[0])
-            p_null.append(tail[1:])
-            excess.append(float(inside[0] - mean) / 2)
+        low, high = np.array(list(_windows(size, ordered=axis != problem.declaration.cluster))).T
+        inside = cumulative[:, high + 1] - cumulative[:, low]
+        blocks += ((axis, *window) for window in zip(low.tolist(), high.tolist(), strict=True))
+        p.append(gamma_tail(inside, inside[1:].mean(0), inside[1:].var(0))[0])
+        excess.append((inside[0] - inside[1:].mean(0)) / 2)
     if not blocks:
         return (), maps
-    adjusted = family_wise(np.array(p), np.stack(p_null, axis=1).min(axis=1))
+    tails = np.concatenate(p, axis=1)
+    adjusted = family_wise(tails[0], tails[1:].min(axis=1))
     found = [
-        CoordinateFinding(*block, p_value=float(adjusted[i]), excess=excess[i])
-        for i, block in enumerate(blocks)
+        CoordinateFinding(*block, p_value=float(adjusted[i]), excess=float(e))
+        for i, (block, e) in enumerate(zip(blocks, np.concatenate(excess), strict=True))
         if adjusted[i] < 0.01
     ]
     return _without_overlap(found), maps
