@@ -38,12 +38,12 @@ class Replicates:
     fitted: Fit
     projection: Projection
     keys: jax.Array
-    raw: jax.Array
-    observed: jax.Array
-    projected: jax.Array
+    raw: np.ndarray
+    observed: np.ndarray
+    projected: np.ndarray
     gradients: Mapping[str, jax.Array]
 
-    def portions(self) -> Iterator[tuple[jax.Array, Mapping[str, jax.Array]]]:
+    def portions(self) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
         """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
         return _portions(self.problem, self.fitted, self.projection, self.keys)
 
@@ -61,10 +61,10 @@ def replicate(
         settings: how many replicates there are, and how many of them are taken to the sites.
     """
     keys = jax.random.split(key, settings.replicates)
-    raw = projection.before_fit(problem.compiled.residual(fitted.x))
+    raw = projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)))
     observed = projection.rows(raw[None])[0]
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
-    gradients = problem.compiled.site_gradient(fitted.x, jnp.concatenate([observed[None], projected]))
+    gradients = problem.compiled.site_gradient(fitted.x, np.concatenate([observed[None], projected]))
     return Replicates(problem, fitted, projection, keys, raw, observed, projected, gradients)
 
 
@@ -82,7 +82,7 @@ def more(drawn: Replicates, times: int) -> Replicates:
     projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
     gradient = drawn.problem.compiled.site_gradient
     parts = [
-        gradient(drawn.fitted.x, jnp.concatenate([drawn.observed[None], projected[low : low + first]]))
+        gradient(drawn.fitted.x, np.concatenate([drawn.observed[None], projected[low : low + first]]))
         for low in range(0, len(projected), first)  # of the shape that is compiled
     ]
     own = {n: g[:1] for n, g in drawn.gradients.items()}
@@ -90,18 +90,18 @@ def more(drawn: Replicates, times: int) -> Replicates:
     return replace(drawn, projected=projected, gradients=gradients)
 
 
-def _projected(problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array) -> jax.Array:
+def _projected(problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array) -> np.ndarray:
     parts = _portions(problem, fitted, projection, keys)
-    return jnp.concatenate([projection.rows(rows) for rows, _ in parts])
+    return np.concatenate([projection.rows(rows) for rows, _ in parts])
 
 
 def _portions(
     problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array
-) -> Iterator[tuple[jax.Array, Mapping[str, jax.Array]]]:
+) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
     """Portions of one size are drawn, so that one program serves all; of the last one as much as there are keys."""
     place = np.arange(-(-len(keys) // _PORTION) * _PORTION).reshape(-1, _PORTION)
     for part in place:
         own = keys[np.minimum(part, len(keys) - 1)]
         rows, values = problem.compiled.replicate(fitted.x, own)
         count = int((part < len(keys)).sum())
-        yield projection.with_prior(rows, own)[:count], {n: v[:count] for n, v in values.items()}
+        yield projection.with_prior(np.asarray(rows), own)[:count], {n: v[:count] for n, v in values.items()}

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -124,9 +123,9 @@ def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients
     return Site(name, axes, grown, gradients, kinds)
 
 
-def observed(problem: Problem, rows: jax.Array) -> Iterator[Site]:
+def observed(problem: Problem, rows: np.ndarray) -> Iterator[Site]:
     """Spreads of what is observed, from projected rows (n, cluster, row); locations too where the model names no site."""
-    flat = problem.rows.unstack(np.asarray(rows))
+    flat = problem.rows.unstack(rows)
     start = 0
     for name, count in problem.components.items():
         site = problem.declaration.observed[name]
@@ -143,10 +142,10 @@ def observed(problem: Problem, rows: jax.Array) -> Iterator[Site]:
                 yield Site(name, site.axes, value, part, {kind: np.ones(())}, tuple(moved))
 
 
-def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> jax.Array:
+def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> np.ndarray:
     """Whitened shifts (n, cluster, row) of perturbations (n, *site), to first order."""
     if site.rows is None:
-        return jnp.moveaxis(problem.compiled.site_shift(x, {site.name: steps}), -1, 0)
+        return np.moveaxis(np.asarray(problem.compiled.site_shift(x, {site.name: steps})), -1, 0)
     parts = (np.real(steps), np.imag(steps))
     found = []
     for i in range(len(steps)):
@@ -156,8 +155,8 @@ def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> j
         }
         for place, part in zip(site.rows, parts, strict=False):
             rows[site.name][place] = part[i]
-        found.append(problem.rows.stack({n: jnp.asarray(v) for n, v in rows.items()}))
-    return jnp.stack(found)
+        found.append(np.asarray(problem.rows.stack({n: jnp.asarray(v) for n, v in rows.items()})))
+    return np.stack(found)
 
 
 def families(along: Along, site: Site) -> Iterator[tuple[Family, np.ndarray]]:

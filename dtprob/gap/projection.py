@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Final, NamedTuple
+from functools import partial
+from typing import Final, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap import fit as fitting
 from dtprob.gap.active import activate, basis, effect_prior
 from dtprob.gap.newton import positive
 from dtprob.gap.problem import Problem
+from dtprob.gap.quick import quick_jit
 
 _FAINT: Final = 1e-3
 """Share of the data's information on a coordinate below which its prior's is not looked at."""
 _TOGETHER: Final = 32
 """Clusters whose projected columns are held at once."""
+_FEWEST_DRAWN: Final = 64
+"""Numbers of a replicate that are drawn at least."""
 _ROUNDING: Final = 1e-9
 """What is left of a coordinate after its fit is taken back, as a share of the fit, is zero below this."""
 
@@ -49,50 +52,41 @@ class Projection:
         origin: the flat vector of the fit, with what the prior knows at its centre.
     """
 
-    columns: jax.Array
-    local_columns: jax.Array
-    local_inverse: jax.Array
-    global_inverse: jax.Array
-    reduced: jax.Array
+    columns: np.ndarray
+    local_columns: np.ndarray
+    local_inverse: np.ndarray
+    global_inverse: np.ndarray
+    reduced: np.ndarray
     shared: Known
     own: Known
     origin: np.ndarray
 
-    def before_fit(self, residual: jax.Array) -> jax.Array:
+    def before_fit(self, residual: np.ndarray) -> np.ndarray:
         """Rows (cluster, row) with all coordinates back at the centre of their prior, to first order.
 
         A mode is drawn towards its prior, so that its residuals are not those of data whose coordinates were drawn from it:
         only after this are data and replicates alike.
         """
-        moved = jnp.einsum("cmg,g->cm", self.columns, self.shared.deviation)
-        return residual + moved + jnp.einsum("cml,cl->cm", self.local_columns, self.own.deviation)
+        return residual + self.columns @ self.shared.deviation + _each(self.local_columns, self.own.deviation)
 
-    def with_prior(self, rows: jax.Array, keys: jax.Array) -> jax.Array:
+    def with_prior(self, rows: np.ndarray, keys: jax.Array) -> np.ndarray:
         """Rows (replicate, cluster, row) to which the prior's spread of all coordinates is added, by replicates' keys."""
-
-        def drawn(which: int, spread: np.ndarray) -> jax.Array:
-            return jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, which), spread.shape))(keys)
-
         shared, own = (
-            drawn(which, part.spread) * part.spread for which, part in enumerate((self.shared, self.own))
+            _normal(keys, which, part.spread.shape) * part.spread
+            for which, part in enumerate((self.shared, self.own))
         )
-        rows = rows + jnp.einsum("cmg,rg->rcm", self.columns, shared)
-        return rows + jnp.einsum("cml,rcl->rcm", self.local_columns, own)
+        return rows + _all(self.columns, shared) + _each(self.local_columns, own)
 
-    def rows(self, e: jax.Array) -> jax.Array:
+    def rows(self, e: np.ndarray) -> np.ndarray:
         """Rows (..., cluster, row) after the linearised refit of all nuisances."""
-        score = jnp.einsum("cmg,...cm->...g", self.reduced, e)
-        e = e - jnp.einsum("cmg,gh,...h->...cm", self.columns, self.global_inverse, score)
-        local = jnp.einsum("cml,...cm->...cl", self.local_columns, e)
-        return e - jnp.einsum("cml,clk,...ck->...cm", self.local_columns, self.local_inverse, local)
+        e = e - _all(self.columns, _scores(self.reduced, e) @ self.global_inverse.T)
+        return e - self._moved_alone(e)
 
-    def adjust(self, w: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def adjust(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effect columns (cluster, row, k) after projection, and B's part that falls on the global nuisances."""
-        local = jnp.einsum("cml,cmk->clk", self.local_columns, w)
-        w = w - jnp.einsum("cml,cli,cik->cmk", self.local_columns, self.local_inverse, local)
-        cross = jnp.einsum("cmg,cmk->gk", self.reduced, w)
-        coefficients = self.global_inverse @ cross
-        return w - jnp.einsum("cmg,gk->cmk", self.reduced, coefficients), coefficients
+        w = self._without_local(w, slice(None))
+        coefficients = self.global_inverse @ _product(self.reduced, w)
+        return w - self.reduced @ coefficients, coefficients
 
     def information(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """W' P W and B's part that falls on the global nuisances, of effect columns W (cluster, row, k).
@@ -101,32 +95,75 @@ class Projection:
         """
         parts = [slice(low, low + _TOGETHER) for low in range(0, len(w), _TOGETHER)]
         cross = sum((_product(self.reduced[c], self._without_local(w[c], c)) for c in parts), np.zeros(()))
-        coefficients = np.asarray(self.global_inverse) @ cross
+        coefficients = self.global_inverse @ cross
         found = np.zeros((w.shape[-1], w.shape[-1]))
         for c in parts:
-            adjusted = self._without_local(w[c], c) - np.asarray(self.reduced[c]) @ coefficients
+            adjusted = self._without_local(w[c], c) - self.reduced[c] @ coefficients
             found += _product(w[c], adjusted)
         return found, coefficients
 
     def _without_local(self, w: np.ndarray, clusters: slice) -> np.ndarray:
         """Columns (cluster, row, k) of some clusters, their local coordinates projected away."""
-        own = np.asarray(self.local_columns[clusters])
+        own = self.local_columns[clusters]
         if not own.shape[-1]:
             return w
-        return w - own @ (np.asarray(self.local_inverse[clusters]) @ (np.swapaxes(own, 1, 2) @ w))
+        return w - own @ (self.local_inverse[clusters] @ (np.swapaxes(own, 1, 2) @ w))
 
-    def adjoint(self, e: jax.Array) -> jax.Array:
+    def adjoint(self, e: np.ndarray) -> np.ndarray:
         """Rows P' e (..., cluster, row), whose products with columns W are those of e with P W."""
-        score = jnp.einsum("cmg,...cm->...g", self.reduced, e)
-        e = e - jnp.einsum("cmg,gh,...h->...cm", self.reduced, self.global_inverse, score)
-        local = jnp.einsum("cml,...cm->...cl", self.local_columns, e)
-        return e - jnp.einsum("cml,clk,...ck->...cm", self.local_columns, self.local_inverse, local)
+        e = e - _all(self.reduced, _scores(self.reduced, e) @ self.global_inverse.T)
+        return e - self._moved_alone(e)
+
+    def _moved_alone(self, e: np.ndarray) -> np.ndarray:
+        """What a refit of the local coordinates alone moves of rows (..., cluster, row)."""
+        own = self.local_columns
+        score = _apart(e) @ own @ np.swapaxes(self.local_inverse, 1, 2)
+        return np.moveaxis(score @ np.swapaxes(own, 1, 2), 0, -2).reshape(e.shape)
 
 
-def _product(left: Any, right: np.ndarray) -> np.ndarray:
+def _scores(columns: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Products (..., i) of columns (cluster, row, i) with rows (..., cluster, row)."""
+    entries = columns.shape[0] * columns.shape[1]
+    return e.reshape(*e.shape[:-2], entries) @ columns.reshape(entries, columns.shape[-1])
+
+
+def _all(columns: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Rows (..., cluster, row) that steps (..., i) of columns (cluster, row, i) make."""
+    entries = columns.shape[0] * columns.shape[1]
+    moved = steps @ columns.reshape(entries, columns.shape[-1]).T
+    return moved.reshape(*steps.shape[:-1], *columns.shape[:-1])
+
+
+def _each(columns: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Rows (..., cluster, row) that steps (..., cluster, i) of columns (cluster, row, i) make, cluster by cluster."""
+    moved = np.moveaxis(_apart(steps) @ np.swapaxes(columns, 1, 2), 0, -2)
+    return moved.reshape(*steps.shape[:-1], columns.shape[1])
+
+
+def _apart(values: np.ndarray) -> np.ndarray:
+    """Values (..., cluster, i) as (cluster, n, i)."""
+    n = int(np.prod(values.shape[:-2], dtype=int))
+    return np.moveaxis(values, -2, 0).reshape(values.shape[-2], n, values.shape[-1])
+
+
+@partial(quick_jit, static_argnames="size")
+def _standard_normal(keys: jax.Array, which: int, size: int) -> jax.Array:
+    return jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, which), (size,)))(keys)
+
+
+def _normal(keys: jax.Array, which: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Standard normal numbers (key, *shape); drawn in powers of two, so that few programs serve all shapes."""
+    count = int(np.prod(shape, dtype=int))
+    if not count:
+        return np.zeros((len(keys), *shape))
+    size = max(_FEWEST_DRAWN, 1 << max(count - 1, 0).bit_length())
+    return np.asarray(_standard_normal(keys, which, size))[:, :count].reshape(-1, *shape)
+
+
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
     """Sum over clusters and rows of columns (cluster, row, i) times columns (cluster, row, j)."""
     entries = left.shape[0] * left.shape[1]
-    return np.asarray(left).reshape(entries, left.shape[-1]).T @ right.reshape(entries, right.shape[-1])
+    return left.reshape(entries, left.shape[-1]).T @ right.reshape(entries, right.shape[-1])
 
 
 def project(problem: Problem, fitted: fitting.Fit) -> Projection:
@@ -134,18 +171,17 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     active = activate(problem, fitted.effects, spread=fitted.spread)
     directions = basis(problem, active)
     n = len(active.global_index)
-    _, w = problem.compiled.linearised(fitted.x, directions)
+    w = np.asarray(problem.compiled.linearised(fitted.x, directions)[1])
     prior_slope, hessian = problem.compiled.prior(fitted.x, directions)
     _, effect_slope, effect_curvature = effect_prior(problem, active, fitted.x)
-    w_global, w_local = w[..., :n], w[..., n:]
-    local = np.asarray(jnp.einsum("cmi,cmj->cij", w_local, w_local))
-    local = local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
+    w_global, w_local = np.ascontiguousarray(w[..., :n]), np.ascontiguousarray(w[..., n:])
+    transposed = np.swapaxes(w_local, 1, 2)
+    local = transposed @ w_local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
     for j in range(active.local_index.shape[1]):
         local[:, j, j] += effect_curvature[active.local_index[:, j]]
-    local_inverse = jnp.asarray(np.linalg.inv(positive(local)) if local.shape[-1] else local)
-    cross = jnp.einsum("cml,cmg->clg", w_local, w_global)
-    reduced = w_global - jnp.einsum("cml,cli,cig->cmg", w_local, local_inverse, cross)
-    curvature = np.asarray(jnp.einsum("cmi,cmj->ij", w_global, reduced))
+    local_inverse = np.linalg.inv(positive(local)) if local.shape[-1] else local
+    reduced = w_global - w_local @ (local_inverse @ (transposed @ w_global))
+    curvature = _product(w_global, reduced)
     curvature = (
         curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
     )
@@ -156,7 +192,7 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     flat[active.local_index] = np.einsum("jcj->cj", hessian[n:][:, active.local_index])
     flat = flat + effect_curvature
     shared, own = (
-        _known(slope[index], flat[index], np.asarray(jnp.einsum(how, part, part)))
+        _known(slope[index], flat[index], np.einsum(how, part, part))
         for index, how, part in (
             (active.global_index, "cmg,cmg->g", w_global),
             (active.local_index, "cml,cml->cl", w_local),
@@ -166,7 +202,7 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     origin[active.global_index] -= shared.deviation
     origin[active.local_index] -= own.deviation
     origin = np.where(np.abs(origin) < _ROUNDING * np.abs(fitted.x), 0.0, origin)
-    return Projection(w_global, w_local, local_inverse, jnp.asarray(inverse), reduced, shared, own, origin)
+    return Projection(w_global, w_local, local_inverse, inverse, reduced, shared, own, origin)
 
 
 def _known(slope: np.ndarray, precision: np.ndarray, information: np.ndarray) -> Known:

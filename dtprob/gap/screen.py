@@ -173,7 +173,7 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
 
 
 def _replicate_scores(
-    projection: Projection, found: Tangents, rows: jax.Array, values: Mapping[str, jax.Array]
+    projection: Projection, found: Tangents, rows: np.ndarray, values: Mapping[str, jax.Array]
 ) -> np.ndarray:
     """Scores (replicate, column) of mean effects."""
     u = _products(projection.adjoint(rows), found)
@@ -183,10 +183,10 @@ def _replicate_scores(
     return u
 
 
-def _products(rows: jax.Array, found: Tangents) -> np.ndarray:
+def _products(rows: np.ndarray, found: Tangents) -> np.ndarray:
     """Products (..., column) of rows (..., cluster, row) with the columns of mean effects."""
     clusters, entries, count = found.columns.shape
-    flat = np.asarray(rows).reshape(*rows.shape[:-2], clusters * entries)
+    flat = rows.reshape(*rows.shape[:-2], clusters * entries)
     return flat @ found.columns.reshape(clusters * entries, count)
 
 

@@ -102,7 +102,7 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
             " a cause closes the gap"
         )
     projection = project(problem, fitted)
-    columns, reduced = np.asarray(projection.columns), np.asarray(projection.reduced)
+    columns, reduced = projection.columns, projection.reduced
     total = np.einsum("cmi,cmi->i", columns, columns)
     seen = total > 0
     if not seen.all():

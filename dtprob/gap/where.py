@@ -11,7 +11,6 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.bootstrap import Replicates
@@ -85,7 +84,7 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
     at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
     found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
-    found += observed(problem, jnp.concatenate([drawn.observed[None], drawn.projected]))
+    found += observed(problem, np.concatenate([drawn.observed[None], drawn.projected]))
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
     tested = [[family_test(*family) for family in families(along, site)] for site in found]
     null = [test.null for tests in tested for test in tests]
@@ -94,7 +93,7 @@ def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replica
         _finding(problem, fitted, projection, drawn, site=site, tests=tests, smallest=smallest)
         for site, tests in zip(found, tested, strict=True)
     ]
-    blocks, maps = _coordinates(problem, np.asarray(drawn.observed), np.asarray(drawn.projected))
+    blocks, maps = _coordinates(problem, drawn.observed, drawn.projected)
     ordered = tuple(sorted(_spreads_last(findings), key=lambda f: (f.last, f.p_value, -f.gain)))
     sure = {f.site for f in findings if f.p_value <= _SURE}
     named = [
@@ -142,9 +141,9 @@ def _finding(
     best = min(tests, key=lambda test: (test.p_value, -float((test.first[0] ** 2).sum())))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
-    rows = jnp.concatenate([drawn.observed[None], drawn.projected[:CHANCE]])
-    slope = np.asarray(jnp.einsum("ncm,ncm->n", shifts, rows))
-    curvature = np.asarray(jnp.einsum("ncm,ncm->n", shifts, shifts))
+    rows = np.concatenate([drawn.observed[None], drawn.projected[:CHANCE]])
+    slope = np.einsum("ncm,ncm->n", shifts, rows)
+    curvature = np.einsum("ncm,ncm->n", shifts, shifts)
     gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)
     net = max(float(gain[0] - gain[1:].mean()), 0.0)
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])

@@ -26,8 +26,8 @@ def loo(problem: Problem, fitted: Fit) -> Float[np.ndarray, " cluster"]:
         fitted: a mode.
     """
     projection = project(problem, fitted)
-    shared = np.asarray(projection.reduced) @ _root(np.asarray(projection.global_inverse))
-    own = np.asarray(projection.local_columns) @ _root(np.asarray(projection.local_inverse))
+    shared = projection.reduced @ _root(projection.global_inverse)
+    own = projection.local_columns @ _root(projection.local_inverse)
     w = np.concatenate([shared, own], axis=-1)
     residual = np.asarray(problem.compiled.residual(fitted.x))
     leverage, vectors = np.linalg.eigh(np.swapaxes(w, 1, 2) @ w)

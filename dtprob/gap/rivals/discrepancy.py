@@ -10,8 +10,6 @@ from __future__ import annotations
 
 from typing import Final
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -38,12 +36,12 @@ def gaussian_process(seen: Look) -> Claim:
     Args:
         seen: the base fit.
     """
-    rows = jnp.concatenate([seen.drawn.observed[None], seen.drawn.projected])
+    rows = np.concatenate([seen.drawn.observed[None], seen.drawn.projected])
     found = [_at(seen, rows, length) for length in LENGTHS]
     evidence = np.max([values.max(axis=1) for values, _, _ in found], axis=0)
     values, features, curvature = max(found, key=lambda f: f[0][0].max())
     variance = float(VARIANCES[int(np.argmax(values[0]))])
-    score = np.asarray(jnp.einsum("cmf,cm->f", features, rows[0]))
+    score = np.einsum("cmf,cm->f", features, rows[0])
     weights = np.linalg.solve(curvature + np.eye(len(score)) / variance, score)
     share = _shares(seen, features, weights, float(weights @ curvature @ weights))
     ranking = tuple(seen.names[i] for i in np.argsort(-share, kind="stable"))
@@ -66,26 +64,27 @@ def evidences(
     return 0.5 * (VARIANCES[:, None] * square / spread - np.log(spread)).sum(axis=-1)
 
 
-def _at(seen: Look, rows: jax.Array, length: float) -> tuple[np.ndarray, jax.Array, np.ndarray]:
+def _at(seen: Look, rows: np.ndarray, length: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Evidences (1 + replicate, variance), features (cluster, row, feature) and their curvature at a length scale."""
     features = _features(seen.problem, length)
     adjusted, _ = seen.projection.adjust(features)
-    curvature = np.asarray(jnp.einsum("cmf,cmg->fg", features, adjusted))
-    score = np.asarray(jnp.einsum("cmf,ncm->nf", features, rows))
+    flat = features.reshape(-1, features.shape[-1])
+    curvature = flat.T @ adjusted.reshape(flat.shape)
+    score = rows.reshape(len(rows), -1) @ flat
     return evidences((curvature + curvature.T) / 2, score), features, curvature
 
 
-def _shares(seen: Look, features: jax.Array, weights: np.ndarray, norm: float) -> np.ndarray:
+def _shares(seen: Look, features: np.ndarray, weights: np.ndarray, norm: float) -> np.ndarray:
     """Share of the process, as far as the nuisances do not imitate it, along each candidate's tangents."""
     share = np.zeros(len(seen.effects))
     process, _ = seen.projection.adjust((features @ weights)[..., None])
-    inner = np.asarray(jnp.einsum("cmk,cm->k", seen.columns, process[..., 0]))
+    inner = np.einsum("cmk,cm->k", seen.columns, process[..., 0])
     for k, group in enumerate(seen.scores.groups):
         share[k] = float(((inner[group] @ seen.scores.root(k)) ** 2).sum()) / max(norm, 1e-300)
     return share
 
 
-def _features(problem: Problem, length: float) -> jax.Array:
+def _features(problem: Problem, length: float) -> np.ndarray:
     """Random Fourier features (cluster, row, feature) of unit variance at every location, each component its own."""
     rng, located = np.random.default_rng(0), _located(problem)
     parts, most = [], max(located.values())
@@ -98,7 +97,7 @@ def _features(problem: Problem, length: float) -> jax.Array:
             part[component, ..., component, :] = wave
         parts.append(part.reshape(-1, most * _FEATURES))
     flat = np.concatenate([*parts, np.zeros((1, most * _FEATURES))])
-    return jnp.asarray(flat[problem.rows.gather])
+    return flat[problem.rows.gather]
 
 
 def _located(problem: Problem) -> dict[str, int]:
