@@ -12,10 +12,12 @@ import numpy as np
 
 from dtprob.gap import whiten
 from dtprob.gap.quick import quick_jit
-from dtprob.gap.running import Outcome, Runner
+from dtprob.gap.running import Arrays, Outcome, Runner
 
 CHUNK: Final = 16
 """Directions or perturbations that go through a compiled program at a time."""
+_POINTS: Final = 64
+"""Points that are evaluated in one run, at most."""
 _DECIBELS = 10.0 / np.log(10.0)
 
 
@@ -25,48 +27,59 @@ class Compiled:
 
     Args:
         runner: the model.
-        arrays: its arguments that are arrays.
+        arrays: its arguments that are arrays, and what is known of nuisances.
         float_sites: deterministic sites that may be moved, in the largest shape that a candidate gives them.
     """
 
-    def __init__(self, runner: Runner, arrays: Any, float_sites: Mapping[str, jax.ShapeDtypeStruct]) -> None:
-        self._runner, self._arrays, self._float_sites = runner, arrays, float_sites
+    def __init__(
+        self, runner: Runner, arrays: Arrays, float_sites: Mapping[str, jax.ShapeDtypeStruct]
+    ) -> None:
+        self._runner, self.arrays, self._float_sites = runner, arrays, float_sites
+
+    def terms(self, x: Any, arrays: Arrays) -> Terms:
+        """Terms of the log posterior at x, to be traced: derivatives can be taken of it."""
+        found, rows = self._runner.run(x, arrays, {}), {}
+        for name, observed in self._runner.around(found.parameters).items():
+            density = whiten.log_prob(observed, found.values[name])
+            rows[name] = jnp.zeros(self._runner.shapes[name]).at[0].set(density)
+        return Terms(self._runner.rows.stack(rows).sum(1), found.prior, found.local)
 
     @cached_property
-    def evaluate(self) -> Any:
-        """X -> (log likelihood per cluster, log prior of global nuisances, log prior of local ones per cluster)."""
+    def _many(self) -> Callable[[np.ndarray], Terms]:
+        """Points (n, dimension), at most `_POINTS` -> the terms of so many points, zero beyond the given ones.
+
+        One program serves single points and lines of them: how many there are is known only when it runs.
+        """
 
         @jax.jit
-        def evaluate(x: Any, arrays: Any) -> tuple[jax.Array, jax.Array, jax.Array]:
-            found, rows = self._runner.run(x, arrays, {}), {}
-            for name, observed in self._runner.around(found.parameters).items():
-                density = whiten.log_prob(observed, found.values[name])
-                rows[name] = jnp.zeros(self._runner.shapes[name]).at[0].set(density)
-            return self._runner.rows.stack(rows).sum(1), found.prior, found.local
+        def many(xs: jax.Array, count: Any, arrays: Arrays) -> Terms:
+            def put(i: Any, into: Terms) -> Terms:
+                return jax.tree.map(lambda all_, new: all_.at[i].set(new), into, self.terms(xs[i], arrays))
 
-        return lambda x: evaluate(jnp.asarray(x), self._arrays)
+            shapes = jax.eval_shape(self.terms, xs[0], arrays)
+            nothing = jax.tree.map(lambda s: jnp.zeros((len(xs), *s.shape), s.dtype), shapes)
+            return jax.lax.fori_loop(0, count, put, nothing)
 
-    @cached_property
-    def profile(self) -> Any:
-        """X (n, dimension) -> log posterior of the base nuisances (n,), one point after another."""
+        def padded(xs: np.ndarray) -> Terms:
+            whole = np.zeros((_POINTS, xs.shape[1]))
+            whole[: len(xs)] = xs
+            return many(whole, len(xs), self.arrays)
 
-        @jax.jit
-        def profile(xs: jax.Array, arrays: Any) -> jax.Array:
-            def one(x: jax.Array) -> jax.Array:
-                found = self._runner.run(x, arrays, {})
-                return self._likelihood(found) + found.prior + jnp.sum(found.local)
+        return padded
 
-            return jax.lax.map(one, xs)
+    def evaluate(self, x: np.ndarray) -> Terms:
+        """Log likelihood per cluster, log prior of global nuisances, log prior of local ones per cluster at x."""
+        likelihood, prior, local = self._many(np.asarray(x)[None])
+        return Terms(np.asarray(likelihood)[0], np.asarray(prior)[0], np.asarray(local)[0])
 
-        def chunked(xs: np.ndarray) -> np.ndarray:
-            padded = np.concatenate([xs, np.repeat(xs[-1:], -len(xs) % CHUNK, axis=0)])
-            parts = [
-                profile(jnp.asarray(padded[i : i + CHUNK]), self._arrays)
-                for i in range(0, len(padded), CHUNK)
-            ]
-            return np.concatenate([np.asarray(p) for p in parts])[: len(xs)]
-
-        return chunked
+    def profile(self, xs: np.ndarray) -> np.ndarray:
+        """Log posterior of the base nuisances (n,) at points (n, dimension), one after another."""
+        values = []
+        for start in range(0, len(xs), _POINTS):
+            part = xs[start : start + _POINTS]
+            likelihood, prior, local = (np.asarray(term)[: len(part)] for term in self._many(part))
+            values.append(likelihood.sum(1) + prior + local.sum(1))
+        return np.concatenate(values)
 
     def residual(self, x: np.ndarray) -> jax.Array:
         """Whitened residuals (cluster, row) at x."""
@@ -95,7 +108,7 @@ class Compiled:
             return self._runner.rows.stack(residual), jnp.moveaxis(jax.vmap(shifted)(basis), 0, -1)
 
         def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[jax.Array, jax.Array]:
-            parts = [linearised(jnp.asarray(x), chunk, self._arrays) for chunk in _chunks(basis)]
+            parts = [linearised(jnp.asarray(x), chunk, self.arrays) for chunk in _chunks(basis)]
             columns = parts[0][1] if len(parts) == 1 else jnp.concatenate([c for _, c in parts], axis=-1)
             return parts[0][0], columns[..., : len(basis)]
 
@@ -118,7 +131,7 @@ class Compiled:
 
             return jax.lax.map(one, keys)
 
-        return lambda x, keys: replicate(jnp.asarray(x), keys, self._arrays)
+        return lambda x, keys: replicate(jnp.asarray(x), keys, self.arrays)
 
     @cached_property
     def site_gradient(self) -> Any:
@@ -141,7 +154,7 @@ class Compiled:
 
             return jax.lax.map(lambda row: jax.grad(inner)(zero, row), rows)
 
-        return lambda x, rows: site_gradient(jnp.asarray(x), rows, self._arrays)
+        return lambda x, rows: site_gradient(jnp.asarray(x), rows, self.arrays)
 
     @cached_property
     def site_shift(self) -> Any:
@@ -167,7 +180,7 @@ class Compiled:
 
         def chunked(x: np.ndarray, deltas: Mapping[str, np.ndarray]) -> jax.Array:
             n = len(next(iter(deltas.values())))
-            parts = [site_shift(jnp.asarray(x), chunk, self._arrays) for chunk in self._padded(deltas, n)]
+            parts = [site_shift(jnp.asarray(x), chunk, self.arrays) for chunk in self._padded(deltas, n)]
             return jnp.concatenate(parts, axis=-1)[..., :n]
 
         return chunked
@@ -185,7 +198,7 @@ class Compiled:
 
         def chunked(x: np.ndarray, deltas: Mapping[str, Any], n: int) -> np.ndarray:
             parts = [
-                shifted_likelihood(jnp.asarray(x), chunk, self._arrays) for chunk in self._padded(deltas, n)
+                shifted_likelihood(jnp.asarray(x), chunk, self.arrays) for chunk in self._padded(deltas, n)
             ]
             return np.concatenate([np.asarray(part) for part in parts])[:n]
 
@@ -226,7 +239,7 @@ class Compiled:
                 self._runner.rows.stack(signal).sum(1),
             )
 
-        return lambda x: state(jnp.asarray(x), self._arrays)
+        return lambda x: state(jnp.asarray(x), self.arrays)
 
     def sites(self, x: np.ndarray) -> dict[str, jax.Array]:
         """Values of the latent and deterministic sites at x, by name."""
@@ -254,10 +267,18 @@ class Compiled:
             return slope, -jax.vmap(push)(basis)
 
         def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            parts = [prior(jnp.asarray(x), chunk, self._arrays) for chunk in _chunks(basis)]
+            parts = [prior(jnp.asarray(x), chunk, self.arrays) for chunk in _chunks(basis)]
             return np.asarray(parts[0][0]), np.concatenate([c for _, c in parts])[: len(basis)]
 
         return chunked
+
+
+class Terms(NamedTuple):
+    """Terms of the log posterior: log likelihood of clusters, log prior of global nuisances, of clusters' own."""
+
+    likelihood: Any
+    prior: Any
+    local: Any
 
 
 class _State(NamedTuple):

@@ -25,7 +25,7 @@ from dtprob.gap.layout import Block, Layout, make_layout, normal_of, transform_o
 from dtprob.gap.programs import Programs
 from dtprob.gap.quick import quick_jit
 from dtprob.gap.rows import Rows, make_rows
-from dtprob.gap.running import Runner, observations
+from dtprob.gap.running import Arrays, Runner, observations
 from dtprob.inference.posterior import Sampler
 from dtprob.models.declaration import Data, Declaration, Model, declare, split_static, trace_model
 
@@ -85,14 +85,14 @@ class Problem:
             self.rows,
             shapes,
             families,
-            self.known,
+            frozenset(self.known),
         )
 
     def with_live(self, names: Sequence[str]) -> Problem:
         """The same problem with other live effects; what does not depend on them is shared."""
         if set(names) <= {e.name for e in self.live}:
             return self
-        _ = self.programs, self.float_sites, self.field_shapes  # made once, then shared
+        _ = self.programs, self.float_sites, self.field_shapes, self._draw  # made once, then shared
         other = copy(self)
         other.set_live(tuple(e for e in self.effects if e.name in names))
         return other
@@ -115,7 +115,7 @@ class Problem:
     @cached_property
     def compiled(self) -> Compiled:
         """Functions of the flat vector."""
-        return Compiled(self._runner, self.arrays, self.float_sites)
+        return Compiled(self._runner, Arrays(self.arrays, self.known), self.float_sites)
 
     def translate(self, x: np.ndarray, source: Problem) -> np.ndarray:
         """A point of another problem on the same model as a point of this one; what that lacks is at its null."""
@@ -199,7 +199,7 @@ class Problem:
             data = eqx.combine(arrays, self._static)
             grown: dict[str, Any] = {}
             for _ in range(2):  # a site may grow because one before it has
-                found = self._runner.run(jnp.zeros(self.dimension), arrays, grown)
+                found = self._runner.run(jnp.zeros(self.dimension), Arrays(arrays, self.known), grown)
                 values = {n: found.sites[n] for n in self.declaration.deterministic}
                 grown = {n: jnp.zeros(v.shape, v.dtype) for n, v in values.items()}
                 context = Context(data, found.everything)
@@ -299,18 +299,28 @@ class Problem:
 
     def prior_draws(self, key: jax.Array, n: int) -> np.ndarray:
         """Flat vectors (n, dimension) of prior draws of the latent sites, live effects at their null."""
-
-        def run(key: jax.Array, arrays: Any) -> dict[str, Any]:
-            trace = trace_model(self.model, eqx.combine(arrays, self._static), key)
-            return {m: transform_of(trace[m]["fn"]).inv(trace[m]["value"]) for m in self.declaration.latent}
-
-        draws = jax.jit(jax.vmap(run, in_axes=(0, None)))(jax.random.split(key, n), self.arrays)
         x = np.repeat(self.null()[None], n, axis=0)
-        for name, value in draws.items():
+        for name, value in self._draw(jax.random.split(key, n), self.arrays).items():
             if value[0].size:
                 offset = self.layout[name].offset
                 x[:, offset : offset + value[0].size] = np.asarray(value).reshape(n, -1)
         return np.where(np.isfinite(x), x, 0.0)
+
+    @cached_property
+    def _draw(self) -> Any:
+        """(keys (n,), arrays) -> unconstrained prior draws (n, ...) of the latent sites, whatever effects are live."""
+
+        @quick_jit
+        def draw(keys: jax.Array, arrays: Any) -> dict[str, Any]:
+            def one(key: jax.Array) -> dict[str, Any]:
+                trace = trace_model(self.model, eqx.combine(arrays, self._static), key)
+                return {
+                    m: transform_of(trace[m]["fn"]).inv(trace[m]["value"]) for m in self.declaration.latent
+                }
+
+            return jax.lax.map(one, keys)
+
+        return draw
 
     def initial(self, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, jax.Array]:
         """Constrained values at x of the latent sites and of the given live mean effects' parameters, by site name."""

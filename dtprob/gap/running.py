@@ -10,7 +10,6 @@ from typing import Any, NamedTuple, final
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from numpyro import handlers
 from numpyro.primitives import Messenger
 
@@ -31,6 +30,18 @@ class _Shift(Messenger):
     def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         if msg["type"] == "deterministic" and msg["name"] in self._deltas:
             msg["value"] = msg["value"] + self._deltas[msg["name"]]
+
+
+class Arrays(NamedTuple):
+    """What programs take as arguments, so that they serve all data of the same shapes.
+
+    Attributes:
+        data: arguments of the model that are arrays, by name.
+        known: mean and precision, unconstrained, of nuisances that earlier data inform instead of the prior.
+    """
+
+    data: Any
+    known: Mapping[str, tuple[Any, Any]]
 
 
 class Outcome(NamedTuple):
@@ -70,7 +81,7 @@ class Runner:
         rows: the whitened rows of the observations.
         shapes: (component, *site shape) of each observed site's rows.
         families: the distribution family of each observed site.
-        known: mean and precision, unconstrained, of nuisances that earlier data inform instead of the prior.
+        known: nuisances that earlier data inform instead of the prior.
     """
 
     model: Model
@@ -81,15 +92,15 @@ class Runner:
     rows: Rows
     shapes: Mapping[str, tuple[int, ...]]
     families: Mapping[str, str]
-    known: Mapping[str, tuple[np.ndarray, np.ndarray]]
+    known: frozenset[str]
 
     @cached_property
     def run(self) -> Callable[[Any, Any, Mapping[str, Any]], Outcome]:
         """(x, arrays, perturbations of sites) -> what the model says there; all that calls it shares one trace."""
         return jax.jit(self._run)
 
-    def _run(self, x: Any, arrays: Any, deltas: Mapping[str, Any]) -> Outcome:
-        data = eqx.combine(arrays, self.static)
+    def _run(self, x: Any, arrays: Arrays, deltas: Mapping[str, Any]) -> Outcome:
+        data = eqx.combine(arrays.data, self.static)
         latent = {name: self.layout.part(x, name) for name in self.declaration.latent}
         jacobians: dict[str, Any] = {}
 
@@ -110,7 +121,7 @@ class Runner:
             handlers.seed(rng_seed=jax.random.key(0)),
         ):
             self.model(**data)
-        total, local = self._reference_prior(x), jnp.zeros(self.rows.n_cluster)
+        total, local = self._reference_prior(x, arrays.known), jnp.zeros(self.rows.n_cluster)
         for name in self.declaration.latent:
             if name in self.known:
                 continue
@@ -142,10 +153,10 @@ class Runner:
                 parameters[effect.name] = {**unit, FIELD: self.layout.part(x, effect.site_name(FIELD))}
         return parameters
 
-    def _reference_prior(self, x: Any) -> jax.Array:
+    def _reference_prior(self, x: Any, known: Mapping[str, tuple[Any, Any]]) -> jax.Array:
         """Log density, up to a constant, of the nuisances that a reference informs."""
         total = jnp.zeros(())
-        for name, (mean, precision) in self.known.items():
+        for name, (mean, precision) in known.items():
             d = self.layout.part(x, name).reshape(-1) - mean
             total = total - 0.5 * d @ (precision @ d)
         return total
@@ -154,7 +165,7 @@ class Runner:
         """The observed distributions with given parameters."""
         return {n: whiten.Observation(f, dict(parameters[n])) for n, f in self.families.items()}
 
-    def log_prior(self, x: Any, arrays: Any) -> jax.Array:
+    def log_prior(self, x: Any, arrays: Arrays) -> jax.Array:
         """Log prior of the base latents."""
         found = self.run(x, arrays, {})
         return found.prior + jnp.sum(found.local)

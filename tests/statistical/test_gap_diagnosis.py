@@ -63,7 +63,8 @@ def shared_compilation():
             known[key] = make()
         problem = known[key]
         problem.data, problem.arrays = dict(data), split_static(data)[0]
-        problem.programs._arrays = problem.compiled._arrays = problem.arrays
+        problem.programs._arrays = problem.arrays
+        problem.compiled.arrays = problem.compiled.arrays._replace(data=problem.arrays)
         problem.__dict__.pop("observed_values", None)
         return problem
 

@@ -27,7 +27,8 @@ def use(problem, data):
     """Put other data of the same shapes into a compiled problem."""
     problem.data = dict(data)
     problem.arrays = split_static(data)[0]
-    problem.programs._arrays = problem.compiled._arrays = problem.arrays
+    problem.programs._arrays = problem.arrays
+    problem.compiled.arrays = problem.compiled.arrays._replace(data=problem.arrays)
     problem.__dict__.pop("observed_values", None)
     return problem
 

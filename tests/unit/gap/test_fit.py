@@ -198,7 +198,7 @@ def test_modes_of_other_families_are_stationary(name, model):
     fitted = fitting.fit(problem, problem.null(), tolerance=1e-10)
 
     def density(v):
-        likelihood, prior, local = problem.compiled.evaluate(v)
+        likelihood, prior, local = problem.compiled.terms(v, problem.compiled.arrays)
         return likelihood.sum() + prior + local.sum()
 
     slope, curvature = jax.grad(density)(jnp.asarray(fitted.x)), -jax.hessian(density)(jnp.asarray(fitted.x))

@@ -49,7 +49,7 @@ def test_columns_and_residuals_give_the_score_of_each_cluster(case):
     score = jnp.einsum(
         "cmk,cm->ck", problem.compiled.linearised(x, np.eye(len(x)))[1], problem.compiled.residual(x)
     )
-    slope = jax.jacrev(lambda v: problem.compiled.evaluate(v)[0])(jnp.asarray(x))
+    slope = jax.jacrev(lambda v: problem.compiled.terms(v, problem.compiled.arrays)[0])(jnp.asarray(x))
     np.testing.assert_allclose(score, slope, rtol=1e-8, atol=1e-8 * float(jnp.abs(slope).max()))
 
 
@@ -125,7 +125,7 @@ def test_prior_slopes(case):
     _, problem, x = case
 
     def density(v):
-        _, prior, local = problem.compiled.evaluate(v)
+        _, prior, local = problem.compiled.terms(v, problem.compiled.arrays)
         return prior + local.sum()
 
     gradient = jax.grad(density)(jnp.asarray(x))
@@ -169,6 +169,36 @@ def test_a_reference_takes_the_place_of_the_prior():
     np.testing.assert_allclose(precision, spread**-2.0, rtol=0.2)
     slope = _slope(problem, problem.start({"a": mean[0], "b": mean[1]}))
     assert np.all(np.abs(slope) < 0.2 / spread)
+
+
+def test_programs_serve_every_reference():
+    texts = set()
+    for at in (0.7, 0.9):
+        problem = Problem(line, draw("line"), EFFECTS, None, PointMass({"a": at, "b": -1.2}))
+        compiled = problem.compiled
+        texts.add(jax.jit(compiled.terms).lower(problem.null(), compiled.arrays).as_text())
+    assert len(texts) == 1
+
+
+def test_a_line_of_any_length_is_the_points_of_it():
+    problem = Problem(line, draw("line"), EFFECTS)
+    points = np.repeat(problem.null()[None], 150, axis=0) + np.linspace(0, 1, 150)[:, None]
+    one_by_one = [sum(term.sum() for term in problem.compiled.evaluate(x)) for x in points]
+    np.testing.assert_allclose(problem.compiled.profile(points), one_by_one, rtol=1e-12)
+
+
+def test_prior_draws_trace_the_model_once():
+    runs = []
+
+    def counted(x, y=None):
+        runs.append(1)
+        return line(x, y)
+
+    problem = Problem(counted, draw("line"), EFFECTS)
+    first = problem.prior_draws(jax.random.key(0), 5)
+    known = len(runs)
+    np.testing.assert_array_equal(problem.prior_draws(jax.random.key(0), 5), first)
+    assert len(runs) == known
 
 
 def test_an_exact_reference_is_accepted():
