@@ -3,20 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
 
 import jax
 
 from dtprob.gap import fit as fitting
-from dtprob.gap.bootstrap import more, replicate
+from dtprob.gap.bootstrap import replicate
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection, project
 from dtprob.gap.screen import Screening, screen
 from dtprob.gap.settings import Settings
 from dtprob.gap.where import Location, locate
-
-_CLEAR: Final = (1e-9, 0.1)
-"""Between these, a first look at the sites does not tell on which side of the level a gap lies."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +44,5 @@ def view(problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settin
     projection = project(problem, fitted)
     drawn = replicate(problem, fitted, projection, key, settings)
     screening = screen(problem, fitted, projection, drawn, settings)
-    location = locate(problem, fitted, projection, drawn)
-    if settings.site_times > 1 and _CLEAR[0] < location.site_p_value < _CLEAR[1]:
-        location = locate(problem, fitted, projection, more(drawn, settings.site_times))
+    location = locate(problem, fitted, projection, drawn, settings)
     return View(problem, fitted, projection, screening, location)

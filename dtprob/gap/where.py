@@ -10,21 +10,26 @@ import functools
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import Final, NamedTuple
 
 import numpy as np
 
-from dtprob.gap.bootstrap import Replicates
+from dtprob.gap.bootstrap import Replicates, more
+from dtprob.gap.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.curves import curves
 from dtprob.gap.families import Site, deterministic, families, observed, shifted
 from dtprob.gap.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
+from dtprob.gap.settings import Settings
 from dtprob.gap.suspects import Suspect, suspects
-from dtprob.gap.tails import family_wise, gamma_tail
+from dtprob.gap.tails import family_wise
 
-_SURE = 0.005
+_SURE: Final = 0.005
 """Probability below which a site is surely wrong."""
+_CLEAR: Final = (1e-9, 0.1)
+"""Between these, a first look at the sites does not tell on which side of the level a gap lies."""
 
 
 @dataclass(frozen=True)
@@ -47,24 +52,6 @@ class SiteFinding:
 
 
 @dataclass(frozen=True)
-class CoordinateFinding:
-    """A block of coordinates that holds more misfit than the model allows.
-
-    Attributes:
-        axis: the data axis.
-        low, high: first and last position of the block.
-        p_value: family-wise over all blocks of all axes.
-        excess: whitened energy above its expectation, in nats.
-    """
-
-    axis: str
-    low: int
-    high: int
-    p_value: float
-    excess: float
-
-
-@dataclass(frozen=True)
 class Location:
     """Maps of the gap at one fit; the suspects come in order of falling evidence.
 
@@ -79,32 +66,48 @@ class Location:
     entries: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
-def locate(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> Location:
+def locate(
+    problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, settings: Settings
+) -> Location:
     """Test every site family and every block of coordinates at a fit."""
+    blocks, maps = scan_coordinates(problem, drawn)
+    seen = _test_sites(problem, fitted, projection, drawn)
+    if settings.site_times > 1 and _CLEAR[0] < seen.p_value < _CLEAR[1]:
+        seen = _test_sites(problem, fitted, projection, more(drawn, settings.site_times))
+    sure = {f.site for f in seen.findings if f.p_value <= _SURE}
+    named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
+    suspected = tuple(sorted(named, key=lambda s: -s.evidence))
+    entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
+    ordered = tuple(sorted(_spreads_last(seen.findings), key=lambda f: (f.last, f.p_value, -f.gain)))
+    return Location(ordered, blocks, maps, seen.p_value, suspected, entries)
+
+
+class _Tested(NamedTuple):
+    """Every site with the tests of its families, and what they say."""
+
+    tested: list[tuple[Site, list[FamilyTest]]]
+    findings: list[SiteFinding]
+
+    @property
+    def p_value(self) -> float:
+        """Family-wise over all sites."""
+        return min((f.p_value for f in self.findings), default=1.0)
+
+
+def _test_sites(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> _Tested:
     at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
     found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
     found += observed(problem, np.concatenate([drawn.observed[None], drawn.projected]))
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    tested = [[family_test(*family) for family in families(along, site)] for site in found]
-    null = [test.null for tests in tested for test in tests]
+    tested = [(site, [family_test(*family) for family in families(along, site)]) for site in found]
+    null = [test.null for _, tests in tested for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
     findings = [
         _finding(problem, fitted, projection, drawn, site=site, tests=tests, smallest=smallest)
-        for site, tests in zip(found, tested, strict=True)
+        for site, tests in tested
     ]
-    blocks, maps = _coordinates(problem, drawn.observed, drawn.projected)
-    ordered = tuple(sorted(_spreads_last(findings), key=lambda f: (f.last, f.p_value, -f.gain)))
-    sure = {f.site for f in findings if f.p_value <= _SURE}
-    named = [
-        s
-        for site, tests in zip(found, tested, strict=True)
-        if site.name in sure
-        for s in suspects(site, tests)
-    ]
-    suspected = tuple(sorted(named, key=lambda s: -s.evidence))
-    entries = {site.name: e for site, tests in zip(found, tested, strict=True) for e in _entries(site, tests)}
-    return Location(ordered, blocks, maps, min((f.p_value for f in ordered), default=1.0), suspected, entries)
+    return _Tested(tested, findings)
 
 
 def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
@@ -148,60 +151,3 @@ def _finding(
     net = max(float(gain[0] - gain[1:].mean()), 0.0)
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
     return SiteFinding(site.name, best.family.label, p_value, net)
-
-
-def _coordinates(
-    problem: Problem, observed: np.ndarray, null: np.ndarray
-) -> tuple[tuple[CoordinateFinding, ...], dict[str, np.ndarray]]:
-    """Energy of the whitened residuals over dyadic blocks of every axis, against its bootstrap distribution."""
-    blocks: list[tuple[str, int, int]] = []
-    p, excess, maps = [], [], {}
-    located = problem.rows.by_cluster(problem.rows.located) == 1
-    for axis, position in problem.rows.coordinates.items():
-        index = np.where(located, problem.rows.by_cluster(position), -1)
-        size = int(index.max()) + 1
-        if size < 2:
-            continue
-        energy = np.stack([_energy(rows, index, size) for rows in (observed, *null)])
-        maps[axis] = (energy[0] - energy[1:].mean(0)) / np.maximum(energy[1:].std(0), 1e-12)
-        cumulative = np.concatenate([np.zeros((len(energy), 1)), np.cumsum(energy, axis=1)], axis=1)
-        low, high = np.array(list(_windows(size, ordered=axis != problem.declaration.cluster))).T
-        inside = cumulative[:, high + 1] - cumulative[:, low]
-        blocks += ((axis, *window) for window in zip(low.tolist(), high.tolist(), strict=True))
-        p.append(gamma_tail(inside, inside[1:].mean(0), inside[1:].var(0))[0])
-        excess.append((inside[0] - inside[1:].mean(0)) / 2)
-    if not blocks:
-        return (), maps
-    tails = np.concatenate(p, axis=1)
-    adjusted = family_wise(tails[0], tails[1:].min(axis=1))
-    found = [
-        CoordinateFinding(*block, p_value=float(adjusted[i]), excess=float(e))
-        for i, (block, e) in enumerate(zip(blocks, np.concatenate(excess), strict=True))
-        if adjusted[i] < 0.01
-    ]
-    return _without_overlap(found), maps
-
-
-def _energy(rows: np.ndarray, index: np.ndarray, size: int) -> np.ndarray:
-    keep = index >= 0
-    return np.bincount(index[keep], weights=(rows[keep] ** 2), minlength=size)
-
-
-def _windows(size: int, *, ordered: bool) -> Iterator[tuple[int, int]]:
-    """Single positions; on ordered axes also half-overlapping blocks of dyadic length below the whole."""
-    length = 1
-    while length < size:
-        for low in range(0, size - length + 1, max(length // 2, 1)):
-            yield low, low + length - 1
-        length *= 2
-        if not ordered:
-            return
-
-
-def _without_overlap(found: list[CoordinateFinding]) -> tuple[CoordinateFinding, ...]:
-    """The strongest blocks of each axis, none overlapping a stronger one."""
-    kept: list[CoordinateFinding] = []
-    for block in sorted(found, key=lambda b: (b.p_value, -b.excess / (b.high - b.low + 1))):
-        if all(b.axis != block.axis or b.high < block.low or block.high < b.low for b in kept):
-            kept.append(block)
-    return tuple(kept[:12])

@@ -7,7 +7,7 @@ from scipy import stats
 from scipy.special import logsumexp
 
 from dtprob.gap import fit as fitting
-from dtprob.gap.bootstrap import replicate
+from dtprob.gap.bootstrap import more, replicate
 from dtprob.gap.plausible import SCALES
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import project
@@ -147,6 +147,30 @@ def test_family_wise_sees_that_copies_are_one_test():
     np.testing.assert_allclose(family_wise(np.array([0.01]), replicates), 0.01, rtol=0.15)
 
 
+def test_family_wise_sees_that_tests_are_more_far_out():
+    """Tails that are heavier than their p-values say: P(min p <= t) = (100 t)^(1 / 1.4)."""
+    replicates = np.random.default_rng(0).uniform(size=20_000) ** 1.4 / 100
+    rare = np.array([0.005**1.4 / 100])
+    assert family_wise(rare, replicates)[0] == pytest.approx(0.005, rel=0.2)
+    assert family_wise(rare, replicates[:99])[0] < 0.004  # a few do not show it
+
+
+def test_a_second_look_at_the_sites_is_of_new_replicates(problem):
+    data = draw("line", seed=3)
+    fitted, _, drawn, _ = look(problem, data)
+    again = more(drawn, 5)
+    assert len(again.projected) == 5 * len(drawn.projected)
+    assert {n: len(g) for n, g in again.gradients.items()} == dict.fromkeys(
+        drawn.gradients, 1 + len(again.projected)
+    )
+    for name, gradient in again.gradients.items():
+        np.testing.assert_array_equal(gradient[0], drawn.gradients[name][0])
+        own = problem.compiled.site_gradient(fitted.x, again.projected[-1:])[name]
+        np.testing.assert_allclose(gradient[-1], own[0], rtol=1e-6, atol=1e-12)
+    alike = np.asarray(again.projected)[:, None] == np.asarray(drawn.projected)[None]
+    assert not alike.all(axis=(2, 3)).any()
+
+
 def test_false_alarms_and_power_over_many_data_sets(problem):
     settings = Settings(replicates=60, site_replicates=60)
     n, level, strong = 200, 0.1, 10
@@ -180,7 +204,7 @@ def beside_a_field():
         drawn = replicate(problem, fitted, projection, jax.random.key(seed), settings)
         found = screen(problem, fitted, projection, drawn, settings)
         z.append(found.z[[found.names.index(n) for n in ("bend", "ripple")]])
-        site.append(locate(problem, fitted, projection, drawn).site_p_value)
+        site.append(locate(problem, fitted, projection, drawn, settings).site_p_value)
     return np.array(z), np.array(site)
 
 
