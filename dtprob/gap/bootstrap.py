@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.fit import Fit
@@ -40,7 +41,7 @@ class Replicates:
     raw: np.ndarray
     observed: np.ndarray
     projected: np.ndarray
-    gradients: Mapping[str, np.ndarray | jax.Array]
+    gradients: Mapping[str, jax.Array]
 
     def portions(self) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
         """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
@@ -85,7 +86,7 @@ def more(drawn: Replicates, times: int) -> Replicates:
         for low in range(0, len(projected), first)  # of the shape that is compiled
     ]
     gradients = {
-        n: np.concatenate([np.asarray(g)[:1], *(np.asarray(part[n])[1:] for part in parts)])
+        n: jnp.asarray(np.concatenate([np.asarray(g)[:1], *(np.asarray(part[n])[1:] for part in parts)]))
         for n, g in drawn.gradients.items()
     }
     return replace(drawn, projected=projected, gradients=gradients)
