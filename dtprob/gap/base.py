@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
+from functools import partial
 
 import jax
 import numpy as np
@@ -11,9 +12,9 @@ from dtprob.effects.effect import effects_of
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
 from dtprob.gap.soundness import broken
+from dtprob.gap.sweep import turned
 
 _PRIOR_DRAWS = 64
-_ANGLES = 8
 _GRID = 121
 _REACH = 3.0
 _ROUNDS = 5
@@ -47,7 +48,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         draws[:, block.index] = np.median(draws[:, block.index], axis=0)
     fits = []
     for x in [np.median(draws, axis=0), *draws[: starts - 1]]:
-        fitted = fitting.fit(problem, _sweep_angles(problem, x))
+        fitted = fitting.fit(problem, turned(problem, x, partial(_local_terms, problem)))
         if np.isfinite(fitted.log_posterior):
             fits.append(fitted)
         values = sorted((f.log_posterior for f in fits), reverse=True)
@@ -57,8 +58,14 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         raise broken(problem, [np.median(draws, axis=0), *draws[: starts - 1]])
     found = _apart(fits)
     freed = [polish(problem, fitted) for fitted in found[:polished]]
-    best = max([*freed, *found[polished:]], key=lambda f: f.log_posterior)
+    best = fitting.settled(problem, max([*freed, *found[polished:]], key=lambda f: f.log_posterior))
     return polish(problem, best, added) if added and not polished else best
+
+
+def _local_terms(problem: Problem, x: np.ndarray) -> np.ndarray:
+    """Log likelihood and local prior of each cluster (cluster,)."""
+    likelihood, _, local = problem.compiled.evaluate(x)
+    return np.asarray(likelihood) + np.asarray(local)
 
 
 def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:
@@ -135,25 +142,3 @@ def _peaks(values: np.ndarray, lines: np.ndarray) -> list[tuple[float, np.ndarra
     near = sorted(others, key=lambda k: abs(k - middle))[:_PEAKS]
     others = sorted({*near, *sorted(others, key=lambda k: -best[k])[:_PEAKS]})
     return [(float(best[k]), lines[int(values[:, k].argmax()), k]) for k in others]
-
-
-def _sweep_angles(problem: Problem, x: np.ndarray) -> np.ndarray:
-    """Coordinate-wise search of cluster-local angles, all clusters at once, so that no cluster starts in a wrong basin."""
-    circular = {name for name, site in problem.declaration.latent.items() if site.is_circular}
-    blocks = [b for b in problem.blocks_of(None) if b.local and b.name in circular]
-    if not blocks:
-        return x
-    x = x.copy()
-    offsets = np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False)
-    for _ in range(2):
-        for block in blocks:
-            for j in range(block.size):
-                position = block.index[:, j]
-                trials = []
-                for offset in offsets:
-                    moved = x.copy()
-                    moved[position] += offset
-                    likelihood, _, local = problem.compiled.evaluate(moved)
-                    trials.append(np.asarray(likelihood) + np.asarray(local))
-                x[position] += offsets[np.argmax(np.stack(trials), axis=0)]
-    return x

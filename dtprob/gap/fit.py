@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -19,6 +20,7 @@ from dtprob.gap.active import LOG_2PI, Active, activate, basis, effect_prior
 from dtprob.gap.newton import NewtonStep, System, local_step, newton_step, positive
 from dtprob.gap.plausible import mixing_gain, nulls, scales, sides
 from dtprob.gap.problem import Problem
+from dtprob.gap.sweep import swept
 
 _TRIES: Final = 8
 _SETTLED: Final = 0.01
@@ -26,6 +28,9 @@ _SETTLED: Final = 0.01
 _FEWEST, _FAINTEST = 0.5, 1e-9
 _LONGEST: Final = float(np.log(3.0))
 _LEAST_DAMPING: Final = 1e-12
+_ROUNDS: Final = 4
+_GAIN: Final = 0.1
+"""Nats by which a fit has to be better to be another one."""
 _STUCK: Final = 1e3
 """Damping beyond which a fit has arrived, whatever its quadratic promises."""
 
@@ -261,16 +266,36 @@ def _mixed(problem: Problem, active: Active, x: np.ndarray, covariance: np.ndarr
     return mixing_gain(covariance[place], x[index] - nulls(effect), scales(effect), one_sided=sided)
 
 
+def settled(problem: Problem, fitted: Fit) -> Fit:
+    """The fit, or a better one, none of whose clusters is in a wrong basin of angles and what goes with them; see `swept`.
+
+    Args:
+        problem: the model and candidates on their data.
+        fitted: to all clusters.
+    """
+    for _ in range(_ROUNDS):
+        active = activate(problem, fitted.effects, spread=fitted.spread)
+        terms = partial(_cluster_terms, problem, active)
+        x = swept(problem, fitted.x, terms)
+        if not terms(x).sum() > terms(fitted.x).sum() + _GAIN:
+            return fitted
+        other = fit(problem, x, fitted.effects, spread=fitted.spread)
+        if other.log_posterior < fitted.log_posterior + _GAIN:
+            return fitted
+        fitted = other
+    return fitted
+
+
 def marginal(problem: Problem, fitted: Fit, *, steps: int = 20) -> np.ndarray:
     """Log marginal likelihood of each cluster (cluster,) given the fit's global coordinates.
 
-    Local coordinates are refitted per cluster and integrated out by Laplace's method, so that clusters that the fit has
-    not seen are judged fairly.
+    Local coordinates are looked for over their whole range, refitted per cluster and integrated out by Laplace's method, so
+    that clusters that the fit has not seen are judged fairly.
     """
     active = activate(problem, fitted.effects, spread=fitted.spread)
-    x = fitted.x.copy()
     if not active.local_index.shape[1]:
-        return _objective(problem, active, x)[1:]
+        return _objective(problem, active, fitted.x)[1:]
+    x = swept(problem, fitted.x, partial(_cluster_terms, problem, active)).copy()
     terms = _cluster_terms(problem, active, x)
     damping = np.float64(1e-3)
     for _ in range(steps):

@@ -30,6 +30,8 @@ from dtprob.inference.posterior import Sampler
 from dtprob.models.declaration import Data, Declaration, Model, declare, split_static, trace_model
 
 _REFERENCE_DRAWS = 1000
+_MIDDLE = 2.563
+"""Standard deviations between the first and the last tenth of a normal distribution."""
 
 
 @final
@@ -321,6 +323,17 @@ class Problem:
             return jax.lax.map(one, keys)
 
         return draw
+
+    @cached_property
+    def usual(self) -> dict[str, tuple[float, float]]:
+        """Centre and standard deviation, by the middle eight tenths of the prior, of the base model's latent sites."""
+        draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
+        low, middle, high = np.quantile(draws, [0.1, 0.5, 0.9], axis=0)
+        blocks = [(b.name, b.index) for b in self.blocks_of(None) if b.size]
+        return {
+            name: (float(np.median(middle[i])), float(np.median(high[i] - low[i])) / _MIDDLE)
+            for name, i in blocks
+        }
 
     def initial(self, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, jax.Array]:
         """Constrained values at x of the latent sites and of the given live mean effects' parameters, by site name."""

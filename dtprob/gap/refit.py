@@ -33,7 +33,8 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     names = (*fitted.effects, effect.name)
     if effect.kind == "variance":
         return fitting.fit(problem, fitted.x, names)
-    return max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
+    best = max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
+    return fitting.settled(problem, best)
 
 
 def polished(
