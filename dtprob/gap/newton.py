@@ -61,7 +61,8 @@ def positive(matrix: np.ndarray) -> np.ndarray:
     if _is_positive(scaled):
         return symmetric
     values, vectors = np.linalg.eigh(scaled)
-    values = np.maximum(np.abs(values), 1e-12)
+    values = np.abs(values)
+    values = np.maximum(values, 1e-12 * np.maximum(values.max(axis=-1, keepdims=True), 1.0))
     return np.einsum("...ij,...j,...kj->...ik", vectors, values, vectors) * outer
 
 

@@ -270,3 +270,11 @@ def test_a_start_whose_curvature_overflows_leads_nowhere():
         problem = Problem(level, {"x": x, "y": x + 0.1}, [shift])
         assert fitting.fit(problem, np.array([84.4])).log_posterior == -np.inf
         assert np.isfinite(fit_base(problem, jax.random.key(0)).log_posterior)
+
+
+@pytest.mark.parametrize("own", [1e-300, 1e-60, 1e-35])
+def test_positive_can_be_inverted_where_a_coordinate_bends_only_with_others(own):
+    matrix = np.array(
+        [[own, 3.0, 1.0, 2.0], [3.0, 2.0, 0.5, 1.0], [1.0, 0.5, 1.0, 1.0], [2.0, 1.0, 1.0, 3.0]]
+    )
+    assert np.all(np.isfinite(np.linalg.inv(positive(matrix))))
