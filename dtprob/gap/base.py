@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from functools import partial
 
 import jax
 import numpy as np
@@ -48,7 +47,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         draws[:, block.index] = np.median(draws[:, block.index], axis=0)
     fits = []
     for x in [np.median(draws, axis=0), *draws[: starts - 1]]:
-        fitted = fitting.fit(problem, turned(problem, x, partial(_local_terms, problem)))
+        fitted = fitting.fit(problem, turned(problem, x, problem.compiled.by_cluster))
         if np.isfinite(fitted.log_posterior):
             fits.append(fitted)
         values = sorted((f.log_posterior for f in fits), reverse=True)
@@ -60,12 +59,6 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     freed = [polish(problem, fitted) for fitted in found[:polished]]
     best = fitting.settled(problem, max([*freed, *found[polished:]], key=lambda f: f.log_posterior))
     return polish(problem, best, added) if added and not polished else best
-
-
-def _local_terms(problem: Problem, x: np.ndarray) -> np.ndarray:
-    """Log likelihood and local prior of each cluster (cluster,)."""
-    likelihood, _, local = problem.compiled.evaluate(x)
-    return np.asarray(likelihood) + np.asarray(local)
 
 
 def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:

@@ -72,6 +72,11 @@ class Compiled:
         likelihood, prior, local = self._many(np.asarray(x)[None])
         return Terms(np.asarray(likelihood)[0], np.asarray(prior)[0], np.asarray(local)[0])
 
+    def by_cluster(self, x: np.ndarray) -> np.ndarray:
+        """Log likelihood and log prior of local nuisances at x, per cluster (cluster,)."""
+        likelihood, _, local = self.evaluate(x)
+        return np.asarray(likelihood) + np.asarray(local)
+
     def profile(self, xs: np.ndarray) -> np.ndarray:
         """Log posterior of the base nuisances (n,) at points (n, dimension), one after another."""
         values = []

@@ -12,11 +12,16 @@ from dtprob.gap.base import polish
 from dtprob.gap.plausible import nulls, scales, sides
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
+from dtprob.gap.sweep import swept
 
 _LINES = 12
 """Parameters of an effect along which starting points are looked for."""
 _BETTER = 0.5
 """Nats by which another optimum has to be higher."""
+_SWEPT = 3
+"""Parameters of an effect whose large sizes are tried with the clusters' angles found anew."""
+_LARGE = np.array([-2.0, -1.4, -0.7, 0.7, 1.4, 2.0])
+"""These sizes, in standard deviations of the prior."""
 _REACH = 0.4
 """Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
@@ -86,7 +91,9 @@ def without(
 def starting_points(
     problem: Problem, x: np.ndarray, effect: Effect, step: np.ndarray | None, settings: Settings
 ) -> list[np.ndarray]:
-    """The one-step estimate and the best local maxima of the log posterior along each parameter.
+    """The one-step estimate, the best local maxima of the log posterior along each parameter, and large sizes.
+
+    The last only where clusters have angles that are found together with other coordinates of theirs; see `swept`.
 
     Args:
         problem: in which the effect is live.
@@ -123,7 +130,25 @@ def starting_points(
         best += [(float(v[k]), line[k]) for k in peaks]
     ordered = sorted(best[1:], key=lambda b: -b[0])[: settings.starts]
     floor = values[0] if len(ordered) else -np.inf
-    return [one_step] + [start for value, start in ordered if value > floor - 5.0]
+    near = [start for value, start in ordered if value > floor - 5.0]
+    return [one_step, *near, *_large(problem, x, effect, settings.starts)]
+
+
+def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[np.ndarray]:
+    """Large sizes of an effect that fit best with the clusters' angles found anew; none where `swept` has nothing to do."""
+    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    scale, sided = scales(effect), sides(effect)
+    found: list[tuple[float, np.ndarray]] = []
+    for j, position in enumerate(index[:_SWEPT]):
+        for size in _LARGE[_LARGE > 0] if sided[j] else _LARGE:
+            moved = x.copy()
+            moved[position] += size * scale[j]
+            start = swept(problem, moved, problem.compiled.by_cluster)
+            if start is moved:
+                return []
+            found.append((float(problem.compiled.by_cluster(start).sum()), start))
+    finite = [one for one in found if np.isfinite(one[0])]
+    return [start for _, start in sorted(finite, key=lambda f: -f[0])[:count]]
 
 
 def at_null_except(problem: Problem, fitted: fitting.Fit, kept: Sequence[str]) -> np.ndarray:

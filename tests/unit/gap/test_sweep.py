@@ -11,6 +11,8 @@ from dtprob.effects import Effect, Parameter
 from dtprob.gap import fit as fitting
 from dtprob.gap.base import fit_base
 from dtprob.gap.problem import Problem
+from dtprob.gap.refit import starting_points
+from dtprob.gap.settings import Settings
 from dtprob.gap.sweep import swept, turned
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
@@ -21,6 +23,11 @@ PHASE = np.array([0.3, -2.0, 1.0, 2.9, -0.6])
 NOISE = 0.1
 BEND = Effect(
     "bend", {"level": lambda value, p, _: value + p["by"]}, (Parameter("by", dist.Normal(0.0, 1.0)),)
+)
+LATER = Effect(
+    "later",
+    {"wave": lambda value, p, _: value * jnp.exp(-1j * p["by"] * FREQUENCY)},
+    (Parameter("by", dist.Normal(0.0, 0.5)),),
 )
 
 
@@ -40,12 +47,9 @@ def delayed(links, y=None):
 def problem():
     noise = jax.random.normal(jax.random.key(0), (2, len(LATE), len(FREQUENCY))) * NOISE / np.sqrt(2)
     wave = np.exp(1j * (PHASE[:, None] - LATE[:, None] * FREQUENCY))
-    return Problem(delayed, {"links": len(LATE), "y": jnp.asarray(wave + noise[0] + 1j * noise[1])}, [BEND])
-
-
-def terms(problem, x):
-    likelihood, _, local = problem.compiled.evaluate(x)
-    return np.asarray(likelihood) + np.asarray(local)
+    return Problem(
+        delayed, {"links": len(LATE), "y": jnp.asarray(wave + noise[0] + 1j * noise[1])}, [BEND, LATER]
+    )
 
 
 def places(problem, x):
@@ -60,7 +64,7 @@ def test_usual_places_are_those_of_the_prior(problem):
 
 def test_every_link_is_freed_from_its_wrong_basin(problem):
     start = problem.start({"scale": 1.0, "phase": np.zeros((5, 1)), "late": np.zeros((5, 1))})
-    stuck = fitting.fit(problem, turned(problem, start, lambda x: terms(problem, x)))
+    stuck = fitting.fit(problem, turned(problem, start, problem.compiled.by_cluster))
     assert np.abs(places(problem, stuck.x) - LATE).max() > 0.3
     free = fitting.settled(problem, stuck)
     np.testing.assert_allclose(places(problem, free.x), LATE, atol=0.06)
@@ -80,9 +84,26 @@ def test_a_link_that_was_left_out_is_judged_at_its_best(problem):
 
 def test_a_sweep_keeps_what_is_best_and_what_is_shared(problem):
     free = fit_base(problem, jax.random.key(1), polished=0)
-    found = swept(problem, free.x, lambda x: terms(problem, x))
-    assert np.all(terms(problem, found) >= terms(problem, free.x))
+    found = swept(problem, free.x, problem.compiled.by_cluster)
+    assert np.all(problem.compiled.by_cluster(found) >= problem.compiled.by_cluster(free.x))
     shared = problem.layout["scale"].index[0]
     np.testing.assert_array_equal(found[shared], free.x[shared])
     nowhere = swept(problem, free.x, lambda x: np.full(len(LATE), np.nan))
     np.testing.assert_array_equal(nowhere, free.x)
+
+
+def test_large_sizes_are_tried_with_the_links_found_anew(problem):
+    free = fit_base(problem, jax.random.key(1), polished=0)
+    wider = problem.with_live(["later"])
+    x, index = wider.translate(free.x, problem), wider.layout["later.by"].index[0]
+    starts = starting_points(wider, x, LATER, None, Settings(starts=2))
+    large = [
+        start
+        for start in starts
+        if np.abs(start[index]).item() >= 0.35 and np.any(places(wider, start) != places(wider, x))
+    ]
+    assert len(large) == 2
+    for start in large:
+        held = x.copy()
+        held[index] = start[index]
+        assert wider.compiled.by_cluster(start).sum() > wider.compiled.by_cluster(held).sum() + 100
