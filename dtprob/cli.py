@@ -14,6 +14,7 @@ from dtprob import __version__
 from dtprob.case import load_case
 from dtprob.errors import InputError, nearest
 from dtprob.reproduce import FIGURES
+from dtprob.threads import one_thread
 from dtprob.xla import avoid_miscompilation
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -153,6 +154,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     command, step, debug = options.pop("command"), options.pop("step", "run"), options.pop("debug")
     signal.signal(signal.SIGTERM, _terminate)
     avoid_miscompilation()
+    one_thread()
     try:
         if "case" in options:  # before anything heavy, so that a mistake in it shows at once
             options["case"] = load_case(options["case"])

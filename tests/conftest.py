@@ -7,9 +7,11 @@ from pathlib import Path
 
 import pytest
 
+from dtprob.threads import one_thread
 from dtprob.xla import avoid_miscompilation
 
 avoid_miscompilation()  # before jax is imported
+one_thread()
 
 import jax  # noqa: E402
 
