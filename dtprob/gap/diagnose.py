@@ -91,7 +91,8 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     noted = notes(problem, base)
     for note in noted:
         say(f"note: {note}")
-    steps = search(problem, base, keys[1], settings, say)
+    searched = search(problem, base, keys[1], settings, say)
+    steps = searched.steps
     noted = (*noted, *idle(steps[0].view.screening.absorbed_by))
     base, last = steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
@@ -113,9 +114,8 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     if remains and (fraction is None or fraction.mean < 1 - settings.minor):
         say("modelling what is left at its site")
         rest = model_remainder(last, folds, held_after, bracket[1], keys[2])
-    return Evidence(
-        problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts, noted, remainder=rest
-    )
+    judged = problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts, noted
+    return Evidence(*judged, remainder=rest, rivals=searched.rivals)
 
 
 def _causes(
@@ -172,11 +172,12 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
         return "UNLISTED" if remains else "UNDETERMINED"
     if remains and cause.closed_fraction.mean < _relevance(evidence, settings):
         return "UNLISTED"
+    leaves = remains and cause.closed_fraction.mean < 1 - settings.minor
     if cause.probability < settings.credibility:
-        return "UNDETERMINED"
-    return (
-        "LISTED_WITH_REMAINDER" if remains and cause.closed_fraction.mean < 1 - settings.minor else "LISTED"
-    )
+        return (
+            "UNLISTED" if leaves else "UNDETERMINED"
+        )  # equally good sets that all leave something are imitations
+    return "LISTED_WITH_REMAINDER" if leaves else "LISTED"
 
 
 def _relevance(evidence: Evidence, settings: Settings) -> float:

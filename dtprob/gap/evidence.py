@@ -19,7 +19,7 @@ from dtprob.gap.where import Location
 class Evidence:
     """The base fit, the steps of the search and the held-out losses before and after the accepted effects.
 
-    `notes` says what is wrong with the base fit itself.
+    `notes` says what is wrong with the base fit itself; `rivals` are where the search ended on its other ways.
     """
 
     problem: Problem
@@ -32,6 +32,7 @@ class Evidence:
     shares: tuple[Share, ...]
     notes: tuple[str, ...] = ()
     remainder: Remainder | None = None
+    rivals: tuple[Start, ...] = ()
 
     @property
     def before(self) -> Location:
@@ -60,7 +61,11 @@ class Evidence:
 
     @property
     def explanations(self) -> dict[tuple[str, ...], Start]:
-        """Sets of effects that differ from the accepted one in one effect at most, fitted; each with its problem."""
+        """Sets of effects, fitted, each with its problem.
+
+        Those that differ from the accepted one in one effect at most, and the rivals, which may have several effects in
+        place of one.
+        """
         found = {frozenset(self.accepted): Start(self.last.problem, self.fitted)}
         for step in self.steps:
             rest = step.view.fitted.effects
@@ -68,4 +73,6 @@ class Evidence:
                 continue
             for fitted in step.trials.fits.values():
                 found.setdefault(frozenset(fitted.effects), Start(step.trials.problem, fitted))
+        for rival in self.rivals:
+            found.setdefault(frozenset(rival.fitted.effects), rival)
         return {one.fitted.effects: one for one in found.values()} if self.accepted else {}

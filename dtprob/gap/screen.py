@@ -20,6 +20,7 @@ from dtprob.gap.active import activate
 from dtprob.gap.bootstrap import Replicates
 from dtprob.gap.directions import Tangents, surroundings, tangents
 from dtprob.gap.fields import field_tests
+from dtprob.gap.pairs import Pair, best_pairs
 from dtprob.gap.plausible import log_bayes_factor, scales
 from dtprob.gap.problem import Problem
 from dtprob.gap.projection import Projection
@@ -64,6 +65,7 @@ class Screening:
     detectable: np.ndarray
     correlation: np.ndarray
     replicate_p: np.ndarray
+    pairs: tuple[Pair, ...]
 
 
 def screen(
@@ -96,6 +98,7 @@ def screen(
         detectable=np.array([_detectable(scores, c, settings) for c in candidates]),
         correlation=_correlation(candidates, scores),
         replicate_p=replicate_p,
+        pairs=() if fitted.effects else scores.pairs,
     )
 
 
@@ -142,6 +145,11 @@ class Scores:
                 for k, group in enumerate(self.groups)
             ]
         )
+
+    @property
+    def pairs(self) -> tuple[Pair, ...]:
+        """The pairs that explain most together."""
+        return best_pairs(self.effects, self.groups, self.information, self.u, self.log_bayes_factor)
 
 
 def _is_one_sided(effect: Effect) -> bool:

@@ -6,15 +6,16 @@ by the model itself. After each accepted effect everything is re-centred at the 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from typing import Final
 
 import jax
+import numpy as np
 
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
-from dtprob.gap.refit import at_null_except, without
+from dtprob.gap.refit import at_null_except, refit, starting_points, without
 from dtprob.gap.settings import Settings
 from dtprob.gap.trials import Say, Start, Trials, best, credit, tried
 from dtprob.gap.view import View, view
@@ -23,6 +24,10 @@ _RETURNS: Final = 3
 """Times that a search may find its starting fit to be no optimum."""
 _REVISIONS: Final = 4
 """Earlier choices that are looked at again after each step."""
+_NEARLY: Final = 3.0
+"""Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect."""
+_UNDERSTATED: Final = 0.15
+"""Share of a gain that first-order scores may miss."""
 
 
 @dataclass(frozen=True)
@@ -34,11 +39,24 @@ class Step:
     accepted: str | None
 
 
-def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> list[Step]:
-    """Steps from the base fit until nothing is significant or worth its prior; the last step accepts nothing.
+@dataclass(frozen=True)
+class Search:
+    """What a search did.
 
-    Where a random field was accepted, which can imitate several effects at once, the search goes on without it too, and the
-    set of more credit stands.
+    Attributes:
+        steps: from the base fit until nothing is significant or worth its prior; the last step accepts nothing.
+        rivals: where the ways ended that were not taken in the end.
+    """
+
+    steps: list[Step]
+    rivals: tuple[Start, ...] = ()
+
+
+def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> Search:
+    """Look for the effects that are missing, one after another; of several ways the one whose end has most credit stands.
+
+    Where a random field was accepted, which can imitate several effects at once, the search goes on without it too. Where
+    a pair promises as much as was reached, it is started from that pair.
 
     Args:
         problem: the model and candidates on their data.
@@ -49,15 +67,60 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     """
     steps = _forward(problem, base, key, settings, say)
     end, base = steps[-1].view, steps[0].view.fitted
+    ways = [steps]
     kinds = {e.name: e.kind for e in problem.effects}
     field = next((name for name in end.fitted.effects if kinds[name] == "variance"), None)
-    if field is None:
-        return steps
-    say(f"looking for effects that {field} may have imitated")
-    rest = _refitted_without(end.problem, end.fitted, field)
-    others = _forward(end.problem, rest, jax.random.fold_in(key, 1), settings, say, base=base, banned=field)
-    with_it, without_it = (credit(problem, one.fitted, base) for one in (end, others[-1].view))
-    return [*steps[:-1], *others] if without_it >= with_it else steps
+    if field is not None:
+        say(f"looking for effects that {field} may have imitated")
+        rest = _refitted_without(end.problem, end.fitted, field)
+        key = jax.random.fold_in(key, 1)
+        others = _forward(end.problem, rest, key, settings, say, base=base, banned=field)
+        ways.append([*steps[:-1], *others])
+    reached = {name: credit(problem, way[-1].view.fitted, base) for name, way in enumerate(ways)}
+    pair = _promising(ways, max(reached.values()) - base.log_evidence, settings)
+    if pair is not None:
+        say(f"starting from {pair[0]} and {pair[1]} together")
+        both = _refitted_with(steps[0].view, pair, settings)
+        others = _forward(
+            both.problem, both.fitted, jax.random.fold_in(key, 2), settings, say, base=base, banned=field
+        )
+        ways.append([*steps[:-1], *others])
+    ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
+    ends = [way[-1].view for way in ways]
+    return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
+
+
+def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
+    """The pair that promises most to first order, if it promises more than one effect, and as much as was reached.
+
+    None where a way ended with it. First order understates: the base fit's spread holds the gap too.
+    """
+    seen = ways[0][0].view
+    ends = [set(way[-1].view.fitted.effects) for way in ways]
+    if not seen.screening.pairs or settings.max_effects < 2 or not any(ends):
+        return None
+    best = seen.screening.pairs[0]
+    kinds = {e.name: e.kind for e in seen.problem.effects}
+    alone = max(
+        bayes
+        for name, bayes in zip(seen.screening.names, seen.screening.log_bayes_factor, strict=True)
+        if kinds[name] == "mean"
+    )
+    enough = max(alone + np.log(len(kinds)) + _NEARLY, (1 - _UNDERSTATED) * reached - _NEARLY)
+    new = not any(set(best.names) <= end for end in ends)
+    return best.names if new and best.log_bayes_factor > enough else None
+
+
+def _refitted_with(seen: View, pair: tuple[str, str], settings: Settings) -> Start:
+    """The base fit with two effects, the second one beside the first and then both together."""
+    problem = seen.problem.with_live(pair)
+    fitted = replace(seen.fitted, x=problem.translate(seen.fitted.x, seen.problem))
+    effects = {e.name: e for e in problem.effects}
+    for name in pair:
+        step = seen.screening.step.get(name) if not fitted.effects else None
+        starts = starting_points(problem, fitted.x, effects[name], step, settings)
+        fitted = refit(problem, fitted, effects[name], starts)
+    return Start(problem, fitted)
 
 
 def _forward(

@@ -49,7 +49,7 @@ def rows(seed, shift=lambda x: 0.0 * x, spread=lambda street: 1.0 + 0.0 * street
 def look(data, seed):
     """The steps of a search."""
     problem, key = Problem(table, data, EFFECTS, "street"), jax.random.key(seed)
-    return search(problem, fit_base(problem, key), key, SETTINGS, print)
+    return search(problem, fit_base(problem, key), key, SETTINGS, print).steps
 
 
 @pytest.mark.parametrize("seed", range(2))

@@ -6,8 +6,9 @@ import pytest
 
 from dtprob.gap.closed import ClosedFraction
 from dtprob.gap.diagnose import decide
+from dtprob.gap.evidence import Evidence
 from dtprob.gap.settings import Settings
-from dtprob.gap.trials import best, credit
+from dtprob.gap.trials import Start, best, credit
 
 
 def evidence(kind, p_after):
@@ -22,9 +23,9 @@ def evidence(kind, p_after):
     )
 
 
-def cause(closed):
+def cause(closed, probability=0.99):
     fraction = None if closed is None else ClosedFraction(closed, closed - 0.1, min(closed + 0.1, 1.0))
-    return SimpleNamespace(closed_fraction=fraction, probability=0.99)
+    return SimpleNamespace(closed_fraction=fraction, probability=probability)
 
 
 @pytest.mark.parametrize(
@@ -45,6 +46,14 @@ def test_verdicts(kind, closed, p_after, verdict):
     assert decide(evidence(kind, p_after), (cause(closed),), Settings()) == verdict
 
 
+@pytest.mark.parametrize(
+    ("closed", "p_after", "verdict"),
+    [(0.8, 1e-6, "UNLISTED"), (0.8, 0.5, "UNDETERMINED"), (0.99, 1e-6, "UNDETERMINED")],
+)
+def test_equally_good_sets_that_leave_something_are_imitations(closed, p_after, verdict):
+    assert decide(evidence("mean", p_after), (cause(closed, 0.6),), Settings()) == verdict
+
+
 def test_no_cause_is_unlisted_where_a_site_is_wrong():
     assert decide(evidence("mean", 1e-6), (), Settings()) == "UNLISTED"
 
@@ -63,3 +72,23 @@ def test_a_random_field_has_to_be_better_by_a_margin(gained, chosen):
     view = SimpleNamespace(problem=problem, fitted=base)
     assert best(view, base, trials, Settings()) == chosen
     assert credit(problem, trials["plain"], base) == trials["plain"].log_evidence
+
+
+def test_several_effects_in_place_of_one_are_an_explanation():
+    def fitted(*names):
+        return SimpleNamespace(effects=names)
+
+    field, pair, neighbour = fitted("field"), fitted("one", "two"), fitted("three")
+    trials = SimpleNamespace(problem="tried", fits={"field": field, "three": neighbour})
+    first = SimpleNamespace(view=SimpleNamespace(fitted=fitted()), trials=trials, accepted="field")
+    end = SimpleNamespace(
+        view=SimpleNamespace(fitted=field, problem="end"),
+        trials=SimpleNamespace(problem="end", fits={}),
+        accepted=None,
+    )
+    given = {"held_before": None, "held_after": None, "bracket": (0.0, 0.0), "fraction": None, "shares": ()}
+    found = Evidence(
+        problem=None, base=None, steps=(first, end), **given, rivals=(Start("beside", pair),)
+    ).explanations
+    assert set(found) == {("field",), ("three",), ("one", "two")}
+    assert found["one", "two"].problem == "beside"
