@@ -44,21 +44,22 @@ def regional_bias(sites: Sites, data: Data) -> list[Effect]:
     ]
 
 
-def scale_bias(sites: Sites, _data: Data) -> list[Effect]:
-    """The predictor exaggerates or shrinks what it predicts."""
+def scale_bias(sites: Sites, data: Data) -> list[Effect]:
+    """The predictor exaggerates or shrinks what it predicts, and is right at a level that nobody knows."""
     if not offers(sites, "predicted_label"):
         return []
+    typical = 0.3
 
     def stretch(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-        return value + (value - jnp.mean(value)) * jnp.expm1(p["log_scale"])
+        return value + (value - jnp.mean(value)) * jnp.expm1(p["log_scale"]) + p["offset"]
 
     return [
         Effect(
             "scale_bias",
             {"predicted_label": stretch},
-            (normal("log_scale", 0.3),),
-            physics="Labels differ from their mean by a common factor more than predicted.",
-            source="m + (y - m) exp(a), m the mean prediction.",
+            (normal("log_scale", typical), normal("offset", typical * _unit(data))),
+            physics="Labels differ by a common factor more than predicted from a level at which the prediction is right.",
+            source="m + (y - m) exp(a) + b, m the mean prediction: a line in place of the diagonal.",
         )
     ]
 

@@ -127,7 +127,7 @@ class Answer:
     def covered_size(self) -> list[bool]:
         """Whether the 90% interval of the size holds the true one, where one right effect has a comparable size."""
         sizes = list(self.first.get("size", {}).values()) if self.first else []
-        if not self.is_right or len(self.truth["effects"]) != 1 or len(sizes) != 1:
+        if not self.is_right or len(self.truth["effects"]) != 1 or not sizes:
             return []
         effect = self.truth["effects"][0]
         values = PARAMETERS.get(self.track, {}).get(str(effect.get("family")))

@@ -131,7 +131,7 @@ PARAMETERS: Final[Mapping[str, Mapping[str, Sizes]]] = {
     "labels": {"scale_bias": lambda slope: (float(np.log1p(slope)), float(np.log1p(-slope)))},
     "custom": {"wall": _as_is, "handover": _either},
 }
-"""Families whose size means the same in truth and library: the values that the library's one parameter can then have.
+"""Families whose size means the same in truth and library: the values that the library's first parameter can then have.
 
 A sign that the key does not tell may be either. Families whose shape is another in truth, as zones with soft edges are,
 have no size to compare: what the library's parameter should be is then not what the key holds.

@@ -80,7 +80,7 @@ ADVICE: Mapping[str, str] = {
     "duty_cycle": "limit the device to its duty cycle",
     # labels
     "regional_bias": "correct the predictions in the region concerned",
-    "scale_bias": "scale the predictions by the estimated factor",
+    "scale_bias": "scale and shift the predictions by the estimates",
     "covariate_shift": "weight the labelled points as the unlabelled ones are distributed",
     "label_noise": "raise the noise of the labels to the estimate",
     "stale_map": "replace the map behind the predictions by a current one",
