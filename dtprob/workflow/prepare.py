@@ -259,7 +259,7 @@ def _effects(case: Case, model: Model, arguments: Mapping[str, Any]) -> tuple[Ef
         chosen += _own_effects(name, case) if ":" in name else [name]
     offered = catalogue(sites, arguments, use="all" if use == "all" else chosen)
     left_out = case.effects.exclude
-    known = {*summaries(), *(effect.name for effect in offered)}
+    known = {*summaries(), *(n for effect in offered for n in (effect.name, effect.family))}
     for name in left_out:
         if name not in known:
             raise unknown_name(f"{case.path.name} [effects] exclude", name, known, "effect")

@@ -46,6 +46,14 @@ def test_the_site_that_sends_less_is_named(folder):
     assert found.maps["clusters"].sizes["segment"] == 30
 
 
+def test_a_family_of_the_users_own_can_be_left_out(folder):
+    case = folder / "case.toml"
+    case.write_text(case.read_text().replace("[effects]", '[effects]\nexclude = ["site_gain"]'))
+    families = {effect.family for effect in prepare(load_case(case), need="diagnosis").effects}
+    assert families
+    assert "site_gain" not in families
+
+
 def test_code_of_the_users_own_can_be_refused(folder):
     with pytest.raises(InputError, match="a model and effects of dtprob"):
         prepare(load_case(folder / "case.toml"), need="diagnosis", allow_code=False)
