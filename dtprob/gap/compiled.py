@@ -75,7 +75,7 @@ class Compiled:
     def by_cluster(self, x: np.ndarray) -> np.ndarray:
         """Log likelihood and log prior of local nuisances at x, per cluster (cluster,)."""
         likelihood, _, local = self.evaluate(x)
-        return np.asarray(likelihood) + np.asarray(local)
+        return likelihood + local
 
     def profile(self, xs: np.ndarray) -> np.ndarray:
         """Log posterior of the base nuisances (n,) at points (n, dimension), one after another."""

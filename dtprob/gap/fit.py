@@ -95,7 +95,7 @@ def _system(problem: Problem, active: Active, x: np.ndarray) -> System:
 
 def _objective(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     """Log posterior as one global entry followed by one per cluster, without weights."""
-    likelihood, prior, local = (np.asarray(v) for v in problem.compiled.evaluate(x))
+    likelihood, prior, local = problem.compiled.evaluate(x)
     extra, _, _ = effect_prior(problem, active, x)
     return np.concatenate([[float(prior) + extra], likelihood + local])
 
@@ -277,6 +277,8 @@ def settled(problem: Problem, fitted: Fit) -> Fit:
         active = activate(problem, fitted.effects, spread=fitted.spread)
         terms = partial(_cluster_terms, problem, active)
         x = swept(problem, fitted.x, terms)
+        if x is fitted.x:  # nothing to look for together
+            return fitted
         if not terms(x).sum() > terms(fitted.x).sum() + _GAIN:
             return fitted
         other = fit(problem, x, fitted.effects, spread=fitted.spread)

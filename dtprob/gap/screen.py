@@ -53,6 +53,7 @@ class Screening:
         detectable: size along the best-determined direction that would be noticed nine times in ten.
         correlation: of the candidates' scores after adjustment; aliases are near +-1.
         replicate_p: smallest p-value over all candidates in each bootstrap replicate.
+        scores: of the mean effects among them.
     """
 
     names: tuple[str, ...]
@@ -65,7 +66,7 @@ class Screening:
     detectable: np.ndarray
     correlation: np.ndarray
     replicate_p: np.ndarray
-    pairs: tuple[Pair, ...]
+    scores: Scores
 
 
 def screen(
@@ -98,7 +99,7 @@ def screen(
         detectable=np.array([_detectable(scores, c, settings) for c in candidates]),
         correlation=_correlation(candidates, scores),
         replicate_p=replicate_p,
-        pairs=() if fitted.effects else scores.pairs,
+        scores=scores,
     )
 
 
@@ -146,9 +147,8 @@ class Scores:
             ]
         )
 
-    @property
     def pairs(self) -> tuple[Pair, ...]:
-        """The pairs that explain most together."""
+        """The pairs that explain most together; costly, so made when asked for."""
         return best_pairs(self.effects, self.groups, self.information, self.u, self.log_bayes_factor)
 
 

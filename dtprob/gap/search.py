@@ -76,8 +76,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         key = jax.random.fold_in(key, 1)
         others = _forward(end.problem, rest, key, settings, say, base=base, banned=field)
         ways.append([*steps[:-1], *others])
-    reached = {name: credit(problem, way[-1].view.fitted, base) for name, way in enumerate(ways)}
-    pair = _promising(ways, max(reached.values()) - base.log_evidence, settings)
+    reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
+    pair = _promising(ways, reached - base.log_evidence, settings)
     if pair is not None:
         say(f"starting from {pair[0]} and {pair[1]} together")
         both = _refitted_with(steps[0].view, pair, settings)
@@ -97,16 +97,14 @@ def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Setting
     """
     seen = ways[0][0].view
     ends = [set(way[-1].view.fitted.effects) for way in ways]
-    if not seen.screening.pairs or settings.max_effects < 2 or not any(ends):
+    if settings.max_effects < 2 or not any(ends):
         return None
-    best = seen.screening.pairs[0]
-    kinds = {e.name: e.kind for e in seen.problem.effects}
-    alone = max(
-        bayes
-        for name, bayes in zip(seen.screening.names, seen.screening.log_bayes_factor, strict=True)
-        if kinds[name] == "mean"
-    )
-    enough = max(alone + np.log(len(kinds)) + _NEARLY, (1 - _UNDERSTATED) * reached - _NEARLY)
+    pairs = seen.screening.scores.pairs()
+    if not pairs:
+        return None
+    best = pairs[0]
+    alone = float(seen.screening.scores.log_bayes_factor.max())
+    enough = max(alone + np.log(len(seen.problem.effects)) + _NEARLY, (1 - _UNDERSTATED) * reached - _NEARLY)
     new = not any(set(best.names) <= end for end in ends)
     return best.names if new and best.log_bayes_factor > enough else None
 

@@ -19,7 +19,7 @@ def family_wise(p: np.ndarray, replicate_p: np.ndarray) -> np.ndarray:
 
     Far out there may be more of them than near the middle, so the level is looked at too where there are the replicates.
     """
-    told = _LEVELS[_LEVELS * len(replicate_p) >= _BELOW]
+    told = _LEVELS[(_LEVELS * len(replicate_p) >= _BELOW) | (_LEVELS.max() == _LEVELS)]
     quantiles = np.quantile(np.maximum(replicate_p, 1e-300), told)
     effective = np.log1p(-told) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
     m = float(np.clip(np.max(effective), 1.0, 1e6))

@@ -142,6 +142,10 @@ def test_family_wise_matches_independent_tests(m):
     np.testing.assert_allclose(family_wise(p, replicates), -np.expm1(m * np.log1p(-p)), rtol=0.15)
 
 
+def test_family_wise_with_a_handful_of_replicates():
+    assert 0.01 < family_wise(np.array([0.01]), np.random.default_rng(0).uniform(size=5))[0] < 0.05
+
+
 def test_family_wise_sees_that_copies_are_one_test():
     replicates = np.random.default_rng(0).uniform(size=4000)
     np.testing.assert_allclose(family_wise(np.array([0.01]), replicates), 0.01, rtol=0.15)

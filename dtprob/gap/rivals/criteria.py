@@ -33,7 +33,7 @@ def loo(problem: Problem, fitted: Fit) -> Float[np.ndarray, " cluster"]:
     leverage, vectors = np.linalg.eigh(np.swapaxes(w, 1, 2) @ w)
     kept = 1 - np.clip(leverage, 0.0, _HIGHEST)
     slope = np.einsum("cmk,cm,ckj->cj", w, residual, vectors)
-    likelihood = np.asarray(problem.compiled.evaluate(fitted.x)[0])
+    likelihood = problem.compiled.evaluate(fitted.x).likelihood
     return likelihood + 0.5 * (np.log(kept) - slope**2 / kept).sum(axis=1)
 
 
