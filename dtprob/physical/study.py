@@ -9,6 +9,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -21,6 +22,8 @@ from dtprob.files import write_text
 
 SHARED: Final = 8
 """Cases of one campaign: the same site, network or survey, with the same unknowns."""
+_CAMPAIGNS: Final = 4
+"""Campaigns that are tried for a case before it is given up."""
 LAMBDAS: Final = (25.0, 100.0, 400.0)
 
 
@@ -135,16 +138,23 @@ class Track[C]:
 
         Raises:
             InputError: an unknown kind or family, nothing asked for, or a lambda that is not positive or that no effect
-                can reach.
+                of several campaigns can reach.
         """
         kinds = self.usual if kinds is None else kinds
         families = self.listed if families is None else families
         lambdas = (float(lambda_),) if isinstance(lambda_, int | float) else tuple(map(float, lambda_))
         self._check(kinds, families, lambdas)
 
-        @lru_cache(maxsize=1)
-        def campaign(number: int) -> C:
-            return self.campaign(np.random.default_rng([seed, number, 0]), number, families)
+        @lru_cache(maxsize=2)
+        def campaign(number: int, again: int) -> C:
+            rng = np.random.default_rng([seed, number, 0, again] if again else [seed, number, 0])
+            return self.campaign(rng, number, families)
+
+        def case(order: Order) -> Mapping[str, Any]:
+            for again in range(_CAMPAIGNS - 1):
+                with suppress(InputError):  # there is no such effect in this campaign
+                    return self.case(out, order, campaign(order.index // SHARED, again))
+            return self.case(out, order, campaign(order.index // SHARED, _CAMPAIGNS - 1))
 
         for index in range(count):
             record = out / "truth" / f"{index:04d}.json"
@@ -152,8 +162,7 @@ class Track[C]:
                 rng = np.random.default_rng([seed, index, 1])
                 size = lambdas[int(rng.integers(len(lambdas)))]
                 order = Order(index, seed, kinds[index % len(kinds)], size, families, rng)
-                truth = self.case(out, order, campaign(index // SHARED))
-                write_text(record, json.dumps(truth, indent=1))  # last: the sign that the case is whole
+                write_text(record, json.dumps(case(order), indent=1))  # last: the sign that the case is whole
             if progress:
                 progress(index + 1, count)
         return self._write_key(out, count, seed)

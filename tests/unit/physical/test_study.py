@@ -1,0 +1,49 @@
+"""The loop over withheld cases, with a track whose campaigns are numbers."""
+
+import json
+
+import pytest
+
+from dtprob.errors import InputError
+from dtprob.physical.study import Track
+
+
+def track(most, drawn=None):
+    """A track whose campaigns carry an effect of a lambda below `most`, drawn anew for each and put on a list."""
+
+    def campaign(rng, _number, _families):
+        strength = most * rng.random()
+        if drawn is not None:
+            drawn.append(strength)
+        return strength
+
+    def case(out, order, strength):
+        if order.lambda_ > strength:
+            raise InputError("withheld case", f"a fault of lambda {order.lambda_:g}", "none", "Ask for less")
+        return order.record([{"name": "fault", "lambda": strength}], ())
+
+    return Track(
+        name="numbers",
+        convention="",
+        kinds=("listed",),
+        usual=("listed",),
+        families=("fault",),
+        listed=("fault",),
+        plan={},
+        campaign=campaign,
+        case=case,
+    )
+
+
+def test_a_campaign_that_cannot_carry_an_effect_is_replaced(tmp_path):
+    drawn = []
+    key = json.loads(track(2.0, drawn).generate(tmp_path, 40, 0, lambda_=1.0).read_text())
+    assert len(key["cases"]) == 40
+    assert min(drawn) < 1 <= min(case["effects"][0]["lambda"] for case in key["cases"])
+    again = json.loads(track(2.0).generate(tmp_path / "again", 40, 0, lambda_=1.0).read_text())
+    assert [c["effects"] for c in again["cases"]] == [c["effects"] for c in key["cases"]]
+
+
+def test_what_no_campaign_can_carry_is_refused(tmp_path):
+    with pytest.raises(InputError, match="Ask for less"):
+        track(1.0).generate(tmp_path, 1, 0, lambda_=1.0)
