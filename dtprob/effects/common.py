@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 from jax import lax
-from jaxtyping import Array, Bool, Complex, Float
+from jaxtyping import Array, Bool, Complex, Float, Int
 
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.raytracing.paths import NONE, PathSet
@@ -95,6 +95,7 @@ def reference_power(data: Data) -> Float[np.ndarray, " 1"] | None:
     return None if channel is None else np.mean(np.abs(np.asarray(channel)) ** 2, keepdims=True).reshape(1)
 
 
+@jax.jit
 def phasor(phase: Float[Array, "*n"]) -> Complex[Array, "*n"]:
     """exp(j phase), exactly 1 at phase 0."""
     return lax.complex(jnp.cos(phase), jnp.sin(phase))
@@ -210,7 +211,9 @@ def touched_objects(data: Data) -> list[tuple[int, str]]:
     return [(int(index), paths.object_names[int(index)]) for index in found]
 
 
-def meets(paths: PathSet, index: int, codes: Sequence[int] = ()) -> Bool[Array, "link path depth"]:
+def meets(
+    paths: PathSet, index: int | Int[Array, ""], codes: Sequence[int] = ()
+) -> Bool[Array, "link path depth"]:
     """Which steps of which paths meet an object, by interactions among `codes` (any by default)."""
     interaction = jnp.asarray(paths.interaction)
     wanted = jnp.isin(interaction, jnp.asarray(codes)) if codes else interaction != NONE

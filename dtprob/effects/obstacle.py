@@ -84,6 +84,7 @@ def _met(paths: PathSet) -> np.ndarray:
     return np.asarray(paths.vertex)[exists]
 
 
+@jax.jit
 def _crossings(paths: PathSet, start: np.ndarray, stop: np.ndarray) -> jax.Array:
     """How often each path crosses the upright screen over a line on the floor, (link, path)."""
     happens = (paths.interaction != NONE)[..., None]

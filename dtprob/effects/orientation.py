@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Final
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -84,6 +85,7 @@ def _outwards(paths: PathSet, side: str) -> Float[Array, "link path 3"]:
     return -jnp.asarray(paths.arrival) if side == "rx" else jnp.asarray(paths.departure)
 
 
+@jax.jit
 def turned(vectors: Float[Array, "*n 3"], rotation: Float[Array, " 3"]) -> Float[Array, "*n 3"]:
     """R v - v for the rotation whose Rodrigues vector is rotation / 2; exactly 0 for no rotation."""
     half = jnp.broadcast_to(rotation / 2, vectors.shape)

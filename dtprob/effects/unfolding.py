@@ -10,6 +10,8 @@ A receiver that moves by d gives s = d; a transmitter -M d, with M the product o
 on the way; a wall that moves by d gives minus its image's shift 2 (n.d) n, mirrored by the walls after it.
 All differences are formed so that nothing moves exactly nothing. What the new geometry does to the reflection
 coefficients is neglected. Source: image method, e.g. ITU-R P.1407 and any text on ray tracing.
+
+What every effect that moves something asks is traced once for all of them.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 from scipy.constants import speed_of_light
 
 from dtprob.effects.common import Sites, meets, offers
@@ -37,6 +40,7 @@ class Moved(NamedTuple):
     departure: Float[Array, "link path 3"]
 
 
+@jax.jit
 def moved(paths: PathSet, shift: Float[Array, "link path 3"]) -> Moved:
     """Change of length and directions of every path; zero where there is no path."""
     length, direction = jnp.where(paths.mask, paths.length, 1.0), jnp.asarray(paths.arrival)
@@ -68,11 +72,13 @@ def rewrites(sites: Sites, shift: Shift) -> dict[str, Rewrite]:
     return {name: rewrite for name, rewrite in table.items() if offers(sites, name)}
 
 
+@jax.jit
 def of_receiver(paths: PathSet, displacement: Float[Array, "*link 3"]) -> Float[Array, "link path 3"]:
     """Shift by a receiver that moves, (3,) for all links alike or (link, 1, 3)."""
     return jnp.broadcast_to(displacement, paths.arrival.shape)
 
 
+@jax.jit
 def of_transmitter(paths: PathSet, displacement: Float[Array, "*link 3"]) -> Float[Array, "link path 3"]:
     """Shift by a transmitter that moves, (3,) for all links alike or (link, 1, 3)."""
     vector = jnp.broadcast_to(displacement, paths.arrival.shape)
@@ -81,8 +87,9 @@ def of_transmitter(paths: PathSet, displacement: Float[Array, "*link 3"]) -> Flo
     return -vector
 
 
+@jax.jit
 def of_object(
-    paths: PathSet, index: int, displacement: Float[Array, "*link_path_depth 3"]
+    paths: PathSet, index: int | Int[Array, ""], displacement: Float[Array, "*link_path_depth 3"]
 ) -> Float[Array, "link path 3"]:
     """Shift by an object whose points of reflection move, (3,) for all alike or (link, path, depth, 3)."""
     moves = meets(paths, index, (SPECULAR,))
@@ -96,6 +103,7 @@ def of_object(
     return -image
 
 
+@jax.jit
 def to_transmitter(paths: PathSet, vector: Float[Array, "link path 3"]) -> Float[Array, "link path 3"]:
     """A vector at the receiver as the transmitter sees it, through all mirrors backwards."""
     for step in reversed(range(paths.depth)):

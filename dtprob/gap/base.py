@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 
 import jax
 import numpy as np
@@ -14,11 +14,12 @@ from dtprob.gap.soundness import broken
 from dtprob.gap.sweep import turned
 
 _PRIOR_DRAWS = 64
-_GRID = 121
+_FINE, _COARSE = 121, 41
+"""Points along a nuisance, and where companions move along."""
 _REACH = 3.0
 _ROUNDS = 5
 _PEAKS = 3
-_MOST = 24
+_MOST = 12
 _SHORT = 4
 _LONG = 3
 _ENOUGH = 3
@@ -56,7 +57,9 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     if not fits:
         raise broken(problem, [np.median(draws, axis=0), *draws[: starts - 1]])
     found = _apart(fits)
-    freed = [polish(problem, fitted) for fitted in found[:polished]]
+    freed: list[fitting.Fit] = []
+    for fitted in found[:polished]:
+        freed.append(polish(problem, fitted, freed=freed))
     best = fitting.settled(problem, max([*freed, *found[polished:]], key=lambda f: f.log_posterior))
     return polish(problem, best, added) if added and not polished else best
 
@@ -70,16 +73,24 @@ def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:
     return kept
 
 
-def polish(problem: Problem, fitted: fitting.Fit, along: Collection[str] | None = None) -> fitting.Fit:
+def polish(
+    problem: Problem,
+    fitted: fitting.Fit,
+    along: Collection[str] | None = None,
+    freed: Sequence[fitting.Fit] = (),
+) -> fitting.Fit:
     """Leave local optima: refit from the other peaks along each global nuisance until none is better.
 
     Args:
         problem: the model on its data.
         fitted: a mode.
         along: names of the nuisances to look along; all by default.
+        freed: modes that no other peak is better than; where one of them is reached the search is over.
     """
     scale = problem.prior_draws(jax.random.key(0), _PRIOR_DRAWS).std(axis=0)
     for _ in range(_ROUNDS):
+        if any(_is_same(fitted, one) for one in freed):
+            return fitted
         peaks = _other_peaks(problem, fitted.x, scale, along)
         short = [fitting.fit(problem, x, fitted.effects, spread=fitted.spread, steps=_SHORT) for x in peaks]
         short.sort(key=lambda f: -f.log_posterior)
@@ -91,6 +102,14 @@ def polish(problem: Problem, fitted: fitting.Fit, along: Collection[str] | None 
     return fitted
 
 
+def _is_same(one: fitting.Fit, other: fitting.Fit) -> bool:
+    """Whether two fits have found the same mode."""
+    apart = (one.x - other.x)[one.global_index]
+    return abs(one.log_posterior - other.log_posterior) < _SAME and bool(
+        apart @ np.linalg.solve(one.covariance, apart) < _SAME
+    )
+
+
 def _other_peaks(
     problem: Problem, x: np.ndarray, scale: np.ndarray, along: Collection[str] | None
 ) -> list[np.ndarray]:
@@ -100,7 +119,6 @@ def _other_peaks(
     permittivity.
     """
     found: list[tuple[float, np.ndarray]] = []
-    offsets = np.linspace(-_REACH, _REACH, _GRID)
     blocks = [b for b in problem.blocks_of(None) if not b.local]
     for block in (b for b in blocks if along is None or b.name in along):
         plates = problem.declaration.sites[block.name].plates
@@ -110,15 +128,16 @@ def _other_peaks(
             if b is not block and plates and problem.declaration.sites[b.name].plates == plates
         ]
         for j, position in enumerate(block.index[0]):
-            lines = []
+            lines, grid = [], _COARSE if others else _FINE
+            offsets = np.linspace(-_REACH, _REACH, grid)
             for shift in _COMPANION if others else (0.0,):
-                line = np.repeat(x[None], _GRID, axis=0)
+                line = np.repeat(x[None], grid, axis=0)
                 line[:, position] += offsets * scale[position]
                 for other in others:
                     if other.size == block.size:
                         line[:, other.index[0][j]] += shift * scale[other.index[0][j]]
                 lines.append(line)
-            values = problem.compiled.profile(np.concatenate(lines)).reshape(len(lines), _GRID)
+            values = problem.compiled.profile(np.concatenate(lines)).reshape(len(lines), grid)
             found += _peaks(np.where(np.isfinite(values), values, -np.inf), np.stack(lines))
     return [point for _, point in sorted(found, key=lambda f: -f[0])[:_MOST]]
 
@@ -130,7 +149,7 @@ def _peaks(values: np.ndarray, lines: np.ndarray) -> list[tuple[float, np.ndarra
         return []
     padded = np.concatenate([[-np.inf], best, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
-    middle = _GRID // 2
+    middle = len(best) // 2
     others = [int(k) for k in peaks if abs(int(k) - middle) > 1]
     near = sorted(others, key=lambda k: abs(k - middle))[:_PEAKS]
     others = sorted({*near, *sorted(others, key=lambda k: -best[k])[:_PEAKS]})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any, Final, NamedTuple, final
 
 import jax
@@ -12,6 +12,7 @@ import numpy as np
 
 from dtprob.gap import whiten
 from dtprob.gap.quick import quick_jit
+from dtprob.gap.rows import stacked
 from dtprob.gap.running import Arrays, Outcome, Runner
 
 CHUNK: Final = 16
@@ -119,24 +120,10 @@ class Compiled:
 
         return chunked
 
-    @cached_property
-    def replicate(self) -> Any:
-        """(x, keys (n,)) -> (whitened residuals (n, cluster, row), observed values (n, ...) by site) drawn at x."""
-
-        @quick_jit
-        def replicate(x: Any, keys: jax.Array, arrays: Any) -> tuple[jax.Array, dict[str, jax.Array]]:
-            observations = self._runner.around(self._runner.run(x, arrays, {}).parameters)
-
-            def one(key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
-                split = zip(observations.items(), jax.random.split(key, len(observations)), strict=True)
-                values = {name: whiten.sample(o, k) for (name, o), k in split}
-                return self._runner.rows.stack(
-                    {n: whiten.residual(o, values[n]) for n, o in observations.items()}
-                ), values
-
-            return jax.lax.map(one, keys)
-
-        return lambda x, keys: replicate(jnp.asarray(x), keys, self.arrays)
+    def replicate(self, x: np.ndarray, keys: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Whitened residuals (n, cluster, row) and observed values (n, ...) by site, drawn at x with keys (n,)."""
+        families = tuple(self._runner.families.items())
+        return _replicate(self._state(x).observed, keys, self._runner.rows.gather, families=families)
 
     @cached_property
     def site_gradient(self) -> Any:
@@ -293,6 +280,25 @@ class _State(NamedTuple):
     observed: dict[str, whiten.Parameters]
     error: jax.Array
     signal: jax.Array
+
+
+@partial(jax.jit, static_argnames="families")
+def _replicate(
+    parameters: Mapping[str, whiten.Parameters],
+    keys: jax.Array,
+    gather: np.ndarray,
+    *,
+    families: tuple[tuple[str, str], ...],
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Draws of observations of these families: whitened residuals (n, cluster, row), and values (n, ...) by site."""
+    observations = {n: whiten.Observation(f, parameters[n]) for n, f in families}
+
+    def one(key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        split = zip(observations.items(), jax.random.split(key, len(observations)), strict=True)
+        values = {name: whiten.sample(o, k) for (name, o), k in split}
+        return stacked({n: whiten.residual(o, values[n]) for n, o in observations.items()}, gather), values
+
+    return jax.lax.map(one, keys)
 
 
 def _filled(given: np.ndarray, like: jax.Array) -> jax.Array:

@@ -7,7 +7,7 @@ are shared along some axes, that vary smoothly, as a ripple or in a cycle along 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -168,12 +168,19 @@ def families(along: Along, site: Site) -> Iterator[tuple[Family, np.ndarray]]:
     """
     patterns = list(_patterns(along, site))
     for kind, factor in site.kinds.items():
-        entries, summed = site.entries(kind), dict[tuple[int, ...], np.ndarray]()
+        summed = _summed(site.entries(kind), {pattern.kept for pattern in patterns})
         for pattern in patterns:
-            if pattern.kept not in summed:
-                gone = tuple(1 + i for i in range(site.value.ndim) if i not in pattern.kept)
-                summed[pattern.kept] = entries.sum(axis=gone)
             yield Family(kind, pattern, factor), pattern.scores(summed[pattern.kept])
+
+
+def _summed(entries: np.ndarray, wanted: Collection[tuple[int, ...]]) -> dict[tuple[int, ...], np.ndarray]:
+    """Entries (n, *site, part) summed over the axes that are not kept, each sum taken from the smallest that holds it."""
+    summed = {tuple(range(entries.ndim - 2)): entries}
+    for kept in sorted(wanted, key=lambda kept: -len(kept)):
+        around = min((k for k in summed if set(kept) <= set(k)), key=lambda k: summed[k].size)
+        gone = tuple(1 + place for place, axis in enumerate(around) if axis not in kept)
+        summed[kept] = summed[around].sum(axis=gone)
+    return summed
 
 
 def _patterns(along: Along, site: Site) -> Iterator[Pattern]:

@@ -11,6 +11,8 @@ from dtprob.gap.tails import variance_ratio_tail
 
 CHANCE: Final = 8
 """Replicates that tell what a site would gain by chance."""
+_ALONE: Final = 1 - 1e-9
+"""Share of an entry's variance above which one replicate is all there is of it: rare outcomes move no other."""
 
 
 class FamilyTest(NamedTuple):
@@ -34,16 +36,18 @@ class FamilyTest(NamedTuple):
 def family_test(family: Family, scores: np.ndarray) -> FamilyTest:
     """Test a family's summed squared scores (1 + replicate, entry), each entry scaled by its null variance."""
     first, n = scores[: 1 + CHANCE].copy(), len(scores) - 1
-    given, null = scores[0], scores[1:]
-    total = (null**2).sum(0)
+    share = scores[1:] ** 2
+    total = share.sum(0)
     variance = total / n
     alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
     if not alive.any():
         return FamilyTest(family, 1.0, np.ones(n), first, variance)
-    null, given, total = null[:, alive], given[alive], total[alive]
-    left_out = (total - null**2) / (n - 1)
-    known = left_out > 1e-9 * total / n  # rare outcomes move an entry in one replicate and in no other
-    statistic = (np.where(known, null**2, 0.0) / np.where(known, left_out, 1.0)).sum(1)
+    given = scores[0]
+    if not alive.all():
+        share, given, total = share[:, alive], given[alive], total[alive]
+    share /= total
+    share[share > _ALONE] = 0.0
+    statistic = (n - 1) * (share / (1.0 - share)).sum(1)  # each replicate scaled by the others
     value = float((given**2 / (total / n)).sum())
     p = variance_ratio_tail(
         np.append(statistic, value), float(statistic.mean()), float(statistic.var()), n - 1

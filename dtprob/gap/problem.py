@@ -199,25 +199,29 @@ class Problem:
 
         def run(arrays: Any) -> dict[str, Any]:
             data = eqx.combine(arrays, self._static)
-            grown: dict[str, Any] = {}
-            for _ in range(2):  # a site may grow because one before it has
+            grown = dict[str, Any]()
+            while True:  # a site may grow because one before it has
                 found = self._runner.run(jnp.zeros(self.dimension), Arrays(arrays, self.known), grown)
                 values = {n: found.sites[n] for n in self.declaration.deterministic}
-                grown = {n: jnp.zeros(v.shape, v.dtype) for n, v in values.items()}
                 context = Context(data, found.everything)
-                for effect in self.effects:
-                    parameters = effect.null()
-                    if effect.kind == "variance":
-                        parameters[FIELD] = jnp.zeros(effect.shape_of_field(values[effect.sites[0]], context))
-                    for site, rewrite in effect.rewrites.items():
-                        shape = jnp.shape(rewrite(values[site], parameters, context))
-                        grown[site] = jnp.zeros(
-                            np.broadcast_shapes(grown[site].shape, shape), grown[site].dtype
-                        )
-            return grown
+                grown = {n: jnp.zeros(s, values[n].dtype) for n, s in self._largest(values, context).items()}
+                if all(grown[n].shape == values[n].shape for n in values):
+                    return grown
 
         sites = cast("dict[str, Any]", jax.eval_shape(run, self.arrays))
         return {n: s for n, s in sites.items() if jnp.issubdtype(s.dtype, jnp.inexact) and s.size}
+
+    def _largest(self, values: Mapping[str, Any], context: Context) -> dict[str, tuple[int, ...]]:
+        """The largest shape that any candidate gives each deterministic site."""
+        shapes = {name: value.shape for name, value in values.items()}
+        for effect in self.effects:
+            parameters = effect.null()
+            if effect.kind == "variance":
+                parameters[FIELD] = jnp.zeros(effect.shape_of_field(values[effect.sites[0]], context))
+            for site, rewrite in effect.rewrites.items():
+                shape = jnp.shape(rewrite(values[site], parameters, context))
+                shapes[site] = np.broadcast_shapes(shapes[site], shape)
+        return shapes
 
     @cached_property
     def field_shapes(self) -> dict[str, tuple[int, ...]]:

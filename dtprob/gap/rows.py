@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -38,8 +39,7 @@ class Rows:
 
     def stack(self, rows: Mapping[str, jax.Array]) -> jax.Array:
         """Rows of all observed sites, (component, *site) each, as (cluster, row), padded with zeros."""
-        flat = jnp.concatenate([*(value.reshape(-1) for value in rows.values()), jnp.zeros(1)])
-        return flat[self.gather]
+        return stacked(rows, self.gather)
 
     def unstack(self, rows: np.ndarray) -> np.ndarray:
         """Rows (..., cluster, row) as (..., flat), as they lie in the observed sites one after another."""
@@ -50,6 +50,11 @@ class Rows:
     def by_cluster(self, values: np.ndarray) -> np.ndarray:
         """A flat per-row array as (cluster, row), padded with -1."""
         return np.concatenate([values, [-1]])[self.gather]
+
+
+def stacked(rows: Mapping[str, jax.Array], gather: Any) -> jax.Array:
+    """Rows of all observed sites by cluster: entries at the positions (cluster, row) of all, a zero behind the last."""
+    return jnp.concatenate([*(value.reshape(-1) for value in rows.values()), jnp.zeros(1)])[gather]
 
 
 def make_rows(

@@ -1,7 +1,9 @@
 """The gain of traced paths and the channel they make, in pure JAX."""
 
+from functools import partial
 from typing import Final
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
@@ -51,13 +53,26 @@ def path_gain(
         for name, value in zip(_NAMES, (permittivity, conductivity, chosen), strict=True)
     ]
     require_supported(paths)
+    return _gain(paths, *values, law)
+
+
+@partial(jax.jit, static_argnames="law")
+def _gain(
+    paths: PathSet,
+    permittivity: Float[Array, " object"],
+    conductivity: Float[Array, " object"],
+    thickness: Float[Array, " object"],
+    law: Law,
+) -> Complex[Array, "link path"]:
+    """`path_gain` of what has been checked, traced once for all that ask."""
+    values = permittivity, conductivity, thickness
     code, index = (jnp.moveaxis(array, 2, 0) for array in (paths.interaction, paths.object))
     normal = components(jnp.moveaxis(paths.normal, 2, 0))
     walls = meet(components(paths.departure), normal, code == SPECULAR)
     found = coefficients(
         walls.cosine, *(value[index] for value in values), frequency=paths.frequency, law=law
     )
-    through = factors(walls, found, code == REFRACTION, _kept(paths, values[0])[index])
+    through = factors(walls, found, code == REFRACTION, _kept(paths, permittivity)[index])
     start = components(jnp.real(paths.tx_field)), components(jnp.imag(paths.tx_field))
     return _receive(paths, *carry(*start, walls, through))
 

@@ -7,6 +7,7 @@ vectorise where the general functions of a CPU do not (they are several times sl
 import math
 from typing import Final
 
+import jax
 import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Complex, Float
@@ -15,6 +16,7 @@ _TERMS: Final = {4: (5, 6), 8: (8, 9)}
 """Terms of the Taylor series of sine and cosine on [-pi/4, pi/4], by size of the number in bytes."""
 
 
+@jax.jit
 def cosine_sine(turns: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
     """Cosine and sine of 2 pi times the argument.
 
