@@ -27,6 +27,8 @@ _FIELD_SHARE: Final = 0.03
 """Share of what was gained over the base fit that a random field has to be better by."""
 _FIELD_NATS: Final = 3.0
 """Nats that it has to be better by in any case."""
+_SURE: Final = 3.0
+"""Nats that an effect has to bring where its score does not show it, beside those of the choice among all."""
 _LIVE: Final = 12
 """Effects that are live at once, at most, where fewer are wanted."""
 _HOPELESS: Final = 0.05
@@ -120,13 +122,17 @@ def credit(problem: Problem, fitted: fitting.Fit, base: fitting.Fit) -> float:
 
 
 def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:
-    """The refit of most credit, if it outweighs the choice among all candidates and is no minor matter."""
+    """The refit of most credit, if the choice among all candidates has been paid for and it is no minor matter.
+
+    The family-wise level of the scores pays; where only the sites have rung the alarm the evidence has to.
+    """
     if not trials:
         return None
     fitted = seen.fitted
     chosen = max(trials, key=lambda name: credit(seen.problem, trials[name], base))
     so_far = fitted.log_evidence - base.log_evidence
-    needed = max(np.log(len(seen.problem.effects)) + 3.0, settings.minor * so_far)
+    paid = float(seen.screening.adjusted.min(initial=1.0)) <= settings.level / 2
+    needed = max(0.0 if paid else np.log(len(seen.problem.effects)) + _SURE, settings.minor * so_far)
     return chosen if trials[chosen].log_evidence - fitted.log_evidence > needed else None
 
 
