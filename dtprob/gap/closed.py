@@ -1,7 +1,7 @@
 """How far: the share of the gap that the causes close, on clusters that the fit has not seen.
 
 G = (L0 - L1) / (L0 - L*), with losses in nats on held-out clusters; the nuisances are refitted in L0, so that calibration
-error is not credited to an effect. The interval is a paired bootstrap over clusters and over the floor's bracket.
+error is not credited to an effect. The interval is a paired bootstrap over clusters and over what the floor may be.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import jax
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy import special
 
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
@@ -83,55 +84,80 @@ def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
     return HeldOut(log_likelihood, error, signal, {n: np.stack(v) for n, v in estimates.items()})
 
 
-def floor(
-    problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: float, n_folds: int
-) -> tuple[float, float]:
-    """Bracket of the best achievable total log likelihood (nats): (pessimistic, optimistic).
+@dataclass(frozen=True)
+class Floor:
+    """The best achievable total log likelihood of held-out clusters, in nats, as far as it is known.
 
-    The pessimistic end is what the fitted causes reach on held-out clusters; the optimistic one adds what moving any one
-    site freely would still gain, and what not knowing the causes' parameters costs: d / 2 nats, d parameters estimated
-    from the share (K - 1) / K of the clusters.
+    Attributes:
+        low, high: bracket of what the causes, with their parameters as they are fitted, and whatever is left could reach.
+        parameters: d of the causes, estimated from the share (K - 1) / K of the clusters.
+        estimation: what not knowing them costs on average, d / 2 K / (K - 1); half a chi-square of d degrees, scaled alike.
+    """
+
+    low: float
+    high: float
+    parameters: float = 0.0
+    estimation: float = 0.0
+
+    @property
+    def best(self) -> float:
+        """Its optimistic end."""
+        return self.high + self.estimation
+
+    @property
+    def middle(self) -> float:
+        """Of its bracket."""
+        return (self.low + self.best) / 2
+
+    def draws(self, count: int, key: jax.Array) -> np.ndarray:
+        """What it may be, (count,)."""
+        u, part = np.asarray(jax.random.uniform(key, (2, count)))
+        half = self.parameters / 2
+        scale = special.gammaincinv(half, u) / half if half else 0.0
+        return self.low + part * (self.high - self.low) + scale * self.estimation
+
+
+def floor(problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: float, n_folds: int) -> Floor:
+    """What the causes at best could reach.
 
     Args:
         problem: in which the causes are live.
         full: the fit with the causes to all clusters.
         after: held-out results with the causes.
-        remaining_gain: nats that a site could still gain, 0 where nothing is significant.
+        remaining_gain: nats that moving any one site freely would still gain, 0 where nothing is significant.
         n_folds: K.
     """
-    reached = float(after.log_likelihood.sum())
     size = sum(e.dimension if e.kind == "mean" else 1 for e in problem.effects if e.name in full.effects)
-    return reached, reached + 0.5 * size * n_folds / (n_folds - 1) + max(remaining_gain, 0.0)
+    cost = 0.5 * size * n_folds / (n_folds - 1)
+    reached = float(after.log_likelihood.sum())
+    return Floor(reached, reached + max(remaining_gain, 0.0), size, cost)
 
 
 def closed_fraction(
-    before: HeldOut, after: HeldOut, bracket: tuple[float, float], key: jax.Array, draws: int = 2000
+    before: HeldOut, after: HeldOut, best: Floor, key: jax.Array, draws: int = 2000
 ) -> ClosedFraction | None:
     """Closed fraction with its 90% interval.
 
     Args:
         before: held-out results without the causes.
         after: held-out results with them.
-        bracket: pessimistic and optimistic floor, total log likelihood.
+        best: what can be reached.
         key: for the bootstrap over clusters.
         draws: bootstrap draws.
     """
     gain, totals = _gains(before, after, key, draws)
     if gain.sum() <= 0 or np.quantile(totals, 0.05) <= 0:
         return None
-    return share(before, after, bracket, key, draws)
+    return share(before, after, best, key, draws)
 
 
-def share(
-    before: HeldOut, after: HeldOut, bracket: tuple[float, float], key: jax.Array, draws: int = 2000
-) -> ClosedFraction:
+def share(before: HeldOut, after: HeldOut, best: Floor, key: jax.Array, draws: int = 2000) -> ClosedFraction:
     """The closed fraction of a gap that is known to be there, below zero where the loss grows; see `closed_fraction`."""
     gain, totals = _gains(before, after, key, draws)
-    rest = np.array(bracket) - float(after.log_likelihood.sum())
-    part = np.asarray(jax.random.uniform(jax.random.fold_in(key, 1), (draws,)))
-    remainder = rest[0] + part * (rest[1] - rest[0])
+    reached = float(after.log_likelihood.sum())
+    remainder = best.draws(draws, jax.random.fold_in(key, 1)) - reached
     low, high = np.quantile(_fraction(totals, remainder), [0.05, 0.95])
-    centre = float(_fraction(gain.sum(), rest.mean()))
+    centre = float(_fraction(gain.sum(), best.middle - reached))
     return ClosedFraction(float(np.clip(centre, low, high)), float(low), float(high))
 
 

@@ -102,7 +102,7 @@ def _place(found: SiteFinding) -> str:
 
 
 def _where(evidence: Evidence) -> dict[str, Any]:
-    total = max(evidence.bracket[1] - float(evidence.held_before.log_likelihood.sum()), 1e-12)
+    total = max(evidence.floor.best - float(evidence.held_before.log_likelihood.sum()), 1e-12)
     excess = sum(c.excess for c in evidence.before.coordinates) or 1.0
     accepted = {e.name: e for e in evidence.problem.effects if e.name in evidence.accepted}
     own = {site for e in accepted.values() for site in e.sites}
@@ -128,7 +128,7 @@ def _where(evidence: Evidence) -> dict[str, Any]:
 
 def _gap(evidence: Evidence) -> dict[str, Any]:
     n = evidence.problem.n_observation
-    best = evidence.bracket[1]
+    best = evidence.floor.best
     before = (best - float(evidence.held_before.log_likelihood.sum())) / n
     after = (best - float(evidence.held_after.log_likelihood.sum())) / n if evidence.accepted else None
     terms: dict[str, Any] = {}
@@ -141,7 +141,7 @@ def _gap(evidence: Evidence) -> dict[str, Any]:
         "unit": "nats per observation",
         "before": before,
         "after": after,
-        "floor": [0.0, max((best - evidence.bracket[0]) / n, 0.0)],
+        "floor": [0.0, max((best - evidence.floor.low) / n, 0.0)],
         "in_user_terms": terms,
     }
 
@@ -253,7 +253,7 @@ def _maps(evidence: Evidence) -> dict[str, xr.Dataset]:
         np.maximum((problem.rows.by_cluster(problem.rows.located) >= 0).sum(1), 1)
         / problem.rows_per_observation
     )
-    entropy = -evidence.bracket[1] / problem.n_observation
+    entropy = -evidence.floor.best / problem.n_observation
     clusters: dict[str, Any] = {
         "before": (name, -evidence.held_before.log_likelihood / per - entropy),
         "after": (name, -evidence.held_after.log_likelihood / per - entropy),

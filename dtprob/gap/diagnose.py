@@ -104,17 +104,17 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
         held_after = closed.judged(last.problem, folds)
     remains = last.location.site_p_value <= settings.level / 2
     left = max((s.gain for s in last.location.sites), default=0.0) if remains else 0.0
-    bracket = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
+    floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     fraction = (
-        closed.closed_fraction(held_before, held_after, bracket, keys[2]) if last.fitted.effects else None
+        closed.closed_fraction(held_before, held_after, floor, keys[2]) if last.fitted.effects else None
     )
     held = held_before, held_after
     parts = shares(last.problem, last.fitted, held, assignment, keys[2]) if fraction is not None else ()
     rest = None
     if remains and (fraction is None or fraction.mean < 1 - settings.minor):
         say("modelling what is left at its site")
-        rest = model_remainder(last, folds, held_after, bracket[1], keys[2])
-    judged = problem, base, tuple(steps), held_before, held_after, bracket, fraction, parts, noted
+        rest = model_remainder(last, folds, held_after, floor.best, keys[2])
+    judged = problem, base, tuple(steps), held_before, held_after, floor, fraction, parts, noted
     return Evidence(*judged, remainder=rest, rivals=searched.rivals)
 
 

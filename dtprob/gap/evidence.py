@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dtprob.gap.closed import ClosedFraction, HeldOut
+from dtprob.gap.closed import ClosedFraction, Floor, HeldOut
 from dtprob.gap.fit import Fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.remainder import Remainder
@@ -27,7 +27,7 @@ class Evidence:
     steps: tuple[Step, ...]
     held_before: HeldOut
     held_after: HeldOut
-    bracket: tuple[float, float]
+    floor: Floor
     fraction: ClosedFraction | None
     shares: tuple[Share, ...]
     notes: tuple[str, ...] = ()

@@ -104,10 +104,11 @@ def model_remainder(
     after = closed.judged(wider, parts)
     reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
     size = sum(_determined(wider, full, n) for n in taken)
-    bracket = reached, max(best, reached + 0.5 * size * len(parts) / (len(parts) - 1))
+    cost = 0.5 * size * len(parts) / (len(parts) - 1)
+    floor = closed.Floor(reached, max(best - cost, reached), size, cost)
     return Remainder(
         tuple(_term(problem, named[n]) for n in taken),
-        closed.share(held, after, bracket, key),
+        closed.share(held, after, floor, key),
         after,
         calibration(problem, folds),
         calibration(wider, parts),

@@ -10,7 +10,7 @@ from scipy import stats
 
 from dtprob.gap import closed
 from dtprob.gap import fit as fitting
-from dtprob.gap.closed import HeldOut
+from dtprob.gap.closed import Floor, HeldOut
 from dtprob.gap.problem import Problem
 from tests.unit.gap.examples import SIGMA, bend, draw, line
 
@@ -55,16 +55,16 @@ def test_fraction_of_a_known_gap():
     gain = 10 + rng.normal(size=400)
     before, after = held(np.zeros(400)), held(gain)
     total = gain.sum()
-    exact = closed.closed_fraction(before, after, (total, total), jax.random.key(0))
+    exact = closed.closed_fraction(before, after, Floor(total, total), jax.random.key(0))
     assert exact is not None
     assert exact.mean == pytest.approx(1.0)
-    half = closed.closed_fraction(before, after, (2 * total, 2 * total), jax.random.key(0))
+    half = closed.closed_fraction(before, after, Floor(2 * total, 2 * total), jax.random.key(0))
     assert half is not None
     assert half.mean == pytest.approx(0.5, abs=0.01)
-    wide = closed.closed_fraction(before, after, (total, 2 * total), jax.random.key(0))
+    wide = closed.closed_fraction(before, after, Floor(total, 2 * total), jax.random.key(0))
     assert wide is not None
-    assert wide.low < 0.55
-    assert wide.high > 0.95
+    assert wide.low == pytest.approx(1 / 1.95, abs=0.01)
+    assert wide.high == pytest.approx(1 / 1.05, abs=0.015)
 
 
 def test_no_fraction_of_a_gap_that_is_not_established():
@@ -72,10 +72,12 @@ def test_no_fraction_of_a_gap_that_is_not_established():
     noise = rng.normal(size=40)
     noise -= noise.mean()
     assert (
-        closed.closed_fraction(held(np.zeros(40)), held(noise + 0.01), (1.0, 2.0), jax.random.key(0)) is None
+        closed.closed_fraction(held(np.zeros(40)), held(noise + 0.01), Floor(1.0, 2.0), jax.random.key(0))
+        is None
     )
     assert (
-        closed.closed_fraction(held(np.zeros(40)), held(-np.ones(40)), (1.0, 2.0), jax.random.key(0)) is None
+        closed.closed_fraction(held(np.zeros(40)), held(-np.ones(40)), Floor(1.0, 2.0), jax.random.key(0))
+        is None
     )
 
 
@@ -86,9 +88,28 @@ def test_interval_covers_the_share_in_the_population():
         gain = 1 + np.random.default_rng(i).normal(size=n)
         rest = gain.sum() + n
         found = closed.closed_fraction(
-            held(np.zeros(n)), held(gain), (rest, rest), jax.random.key(i), draws=400
+            held(np.zeros(n)), held(gain), Floor(rest, rest), jax.random.key(i), draws=400
         )
         hits += found is not None and found.low <= 0.5 <= found.high
+    assert stats.binom.ppf(1e-3, trials, 0.86) <= hits <= stats.binom.ppf(0.999, trials, 0.94)
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_interval_covers_what_estimation_costs(size):
+    """Clusters N(m, 1) of `size` entries, m known to be 0 and in truth 1: what the fit of m does to clusters never seen."""
+    n, parts, trials, hits = 200, 4, 200, 0
+    cost = 0.5 * size * parts / (parts - 1)
+    for i in range(trials):
+        rng = np.random.default_rng(i)
+        y, error = 1 + rng.normal(size=(n, size)), rng.normal(size=size) * np.sqrt(2 * cost / size / n)
+        gain = 0.5 * (y**2 - (y - 1 - error) ** 2).sum(1)
+        reached = float(gain.sum())
+        found = closed.closed_fraction(
+            held(np.zeros(n)), held(gain), Floor(reached, reached, size, cost), jax.random.key(i), draws=400
+        )
+        assert found is not None
+        expected = n * size / 2 - n * (error**2).sum() / 2
+        hits += found.low <= expected / (n * size / 2) <= found.high
     assert stats.binom.ppf(1e-3, trials, 0.86) <= hits <= stats.binom.ppf(0.999, trials, 0.94)
 
 
