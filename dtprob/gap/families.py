@@ -9,7 +9,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, final
 
 import jax.numpy as jnp
 import numpy as np
@@ -23,6 +23,22 @@ _COLUMNS: Final = 16
 """Entries beside the rows up to which each is looked at."""
 
 type Along = Callable[[str, int], Sequence[Curves]]
+
+
+@final
+class Summed:
+    """Scores (n, *kept, part) of the entries of a site, the axes that are not kept summed over."""
+
+    def __init__(self, values: np.ndarray) -> None:
+        self.values = values
+        self._along: dict[int, np.ndarray] = {}
+
+    def along(self, size: int) -> np.ndarray:
+        """The first kept axes together, of so many positions, before all else (size, n * rest); made once."""
+        if size not in self._along:
+            moved = np.moveaxis(self.values.reshape(len(self.values), size, -1), 1, 0)
+            self._along[size] = np.ascontiguousarray(moved).reshape(size, -1)
+        return self._along[size]
 
 
 @dataclass(frozen=True)
@@ -40,12 +56,12 @@ class Pattern:
     kept: tuple[int, ...]
     curves: Curves | None = None
 
-    def scores(self, summed: np.ndarray) -> np.ndarray:
-        """Scores (n, weights) of the weights from those of the entries (n, *kept, part), other axes summed over."""
+    def scores(self, summed: Summed) -> np.ndarray:
+        """Scores (n, weights) of the weights from those of the entries, other axes summed over."""
+        n = len(summed.values)
         if self.curves is None:
-            return summed.reshape(len(summed), -1)
-        n, (_, size) = len(summed), self.curves.extent
-        mixed = self.curves.values @ np.moveaxis(summed.reshape(n, size, -1), 1, 0).reshape(size, -1)
+            return summed.values.reshape(n, -1)
+        mixed = self.curves.values @ summed.along(self.curves.extent[1])
         return np.moveaxis(mixed.reshape(mixed.shape[0], n, -1), 0, 1).reshape(n, -1)
 
     def perturbation(self, weights: np.ndarray, shape: Sequence[int], parts: int) -> np.ndarray:
@@ -168,7 +184,8 @@ def families(along: Along, site: Site) -> Iterator[tuple[Family, np.ndarray]]:
     """
     patterns = list(_patterns(along, site))
     for kind, factor in site.kinds.items():
-        summed = _summed(site.entries(kind), {pattern.kept for pattern in patterns})
+        sums = _summed(site.entries(kind), {pattern.kept for pattern in patterns})
+        summed = {kept: Summed(values) for kept, values in sums.items()}
         for pattern in patterns:
             yield Family(kind, pattern, factor), pattern.scores(summed[pattern.kept])
 
