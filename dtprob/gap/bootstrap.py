@@ -68,8 +68,8 @@ def replicate(
     return Replicates(problem, fitted, projection, keys, raw, observed, projected, gradients)
 
 
-def more(drawn: Replicates, times: int) -> Replicates:
-    """As many times more replicates at the sites, all of them new; fewer where the sites are large.
+def more(drawn: Replicates, times: int) -> Replicates | None:
+    """As many times more replicates at the sites, all of them new; fewer where the sites are large, None where too large.
 
     Args:
         drawn: a first look at the same fit.
@@ -77,7 +77,9 @@ def more(drawn: Replicates, times: int) -> Replicates:
     """
     first = len(drawn.projected)
     entries = sum(g[0].size for g in drawn.gradients.values())
-    times = int(np.clip(_MOST_VALUES / (first * max(entries, 1)), 1, times))
+    times = int(min(_MOST_VALUES / (first * max(entries, 1)), times))
+    if times < 2:
+        return None
     keys = jax.random.split(jax.random.fold_in(drawn.keys[0], times), times * first)
     projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
     gradient = drawn.problem.compiled.site_gradient

@@ -94,11 +94,11 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     searched = search(problem, base, keys[1], settings, say)
     steps = searched.steps
     noted = (*noted, *idle(steps[0].view.screening.absorbed_by))
-    base, last = steps[0].view.fitted, steps[-1].view
+    problem, base, last = steps[0].view.problem, steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
     assignment = closed.folds(problem.n_cluster, settings.folds)
-    folds = list(closed.fold_fits(steps[0].view.problem, base, assignment))
-    held_before = held_after = closed.judged(steps[0].view.problem, folds)
+    folds = list(closed.fold_fits(problem, base, assignment))
+    held_before = held_after = closed.judged(problem, folds)
     if last.fitted.effects:
         folds = list(closed.fold_fits(last.problem, last.fitted, assignment))
         held_after = closed.judged(last.problem, folds)

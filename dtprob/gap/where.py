@@ -72,8 +72,8 @@ def locate(
     """Test every site family and every block of coordinates at a fit."""
     blocks, maps = scan_coordinates(problem, drawn)
     seen = _test_sites(problem, fitted, projection, drawn)
-    if settings.site_times > 1 and _CLEAR[0] < seen.p_value < _CLEAR[1]:
-        seen = _test_sites(problem, fitted, projection, more(drawn, settings.site_times))
+    if _CLEAR[0] < seen.p_value < _CLEAR[1] and (further := more(drawn, settings.site_times)) is not None:
+        seen = _test_sites(problem, fitted, projection, further)
     sure = {f.site for f in seen.findings if f.p_value <= _SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))

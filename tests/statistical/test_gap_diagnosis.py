@@ -21,7 +21,7 @@ from dtprob.gap.fit import fit
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.inference import NUTS, Laplace
-from dtprob.models.declaration import split_static
+from dtprob.models.declaration import model, split_static
 from tests.unit.gap.examples import (
     SIGMA,
     bend,
@@ -252,6 +252,27 @@ def rows(x, device, y=None):
         offset = numpyro.deterministic("offset", jnp.zeros_like(x))
         mean = numpyro.deterministic("mean", offset + slope * x)
         numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+@model(axes={"mean": ("row", "sample")}, cluster="row")
+def wave(x, y=None):
+    """A wave of unknown frequency, with many local optima."""
+    frequency = numpyro.sample("frequency", dist.Normal(1.0, 1.0))
+    mean = numpyro.deterministic("mean", jnp.cos(2 * jnp.pi * frequency * x))
+    with numpyro.plate("row", x.shape[0], dim=-2), numpyro.plate("sample", x.shape[1], dim=-1):
+        numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+def test_a_base_fit_in_a_wrong_basin_is_taken_back(monkeypatch):
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.0, 2.0, (12, 20))
+    data = {"x": x, "y": np.cos(2 * np.pi * 2.0 * x) + SIGMA * rng.normal(size=x.shape)}
+    monkeypatch.setattr(diagnosing, "fit_base", lambda problem, *_, **__: fit(problem, np.array([0.9])))
+    lines = []
+    found = run(wave, data, (bend(), ripple()), say=lines.append)
+    assert any("starting again" in line for line in lines)
+    assert found.verdict == "NO_GAP"
+    assert found.to_report()["fit"]["nuisances"][0]["mean"] == pytest.approx(2.0, abs=0.02)
 
 
 def test_a_column_may_name_the_clusters():
