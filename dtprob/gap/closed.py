@@ -106,14 +106,17 @@ class Floor:
 
     @property
     def middle(self) -> float:
-        """Of its bracket."""
-        return (self.low + self.best) / 2
+        """As likely too low as too high."""
+        return float(self._at(np.array(0.5), np.array(0.5)))
 
     def draws(self, count: int, key: jax.Array) -> np.ndarray:
         """What it may be, (count,)."""
-        u, part = np.asarray(jax.random.uniform(key, (2, count)))
+        return self._at(*np.asarray(jax.random.uniform(key, (2, count))))
+
+    def _at(self, part: np.ndarray, level: np.ndarray) -> np.ndarray:
+        """At a part of the way from low to high, estimation costing a quantile of what it may."""
         half = self.parameters / 2
-        scale = special.gammaincinv(half, u) / half if half else 0.0
+        scale = special.gammaincinv(half, level) / half if half else 0.0
         return self.low + part * (self.high - self.low) + scale * self.estimation
 
 

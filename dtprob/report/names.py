@@ -106,12 +106,14 @@ def allowance(remainder: Remainder) -> str:
 
 
 def _varying(pattern: str) -> str:
-    """How a site family varies, in words: `from link to link`, `as a ripple in time`, `smoothly in time`."""
+    """How a site family varies, in words: `from link to link`, `as a ripple in time`, `in a cycle of 7 along slot`."""
     first = pattern.partition(" ")[0]
     if pattern == "common":
         return "by one amount for all"
     if first == "smooth":
         return f"smoothly {words(pattern.removeprefix('smooth '))}"
+    if first == "every":
+        return f"in a cycle of {words(pattern.removeprefix('every '))}"
     if first in ("ripple", "by", "along", "over"):
         return f"as a {words(pattern)}" if first == "ripple" else words(pattern)
     axes = pattern.split(" x ")

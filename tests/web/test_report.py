@@ -266,6 +266,7 @@ def test_the_remainder_is_told_with_its_calibration(examples: dict[str, Any]) ->
                 ("additive, smooth in time", False),
                 ("relative, link", True),
                 ("additive, by run", True),
+                ("relative, every 7 along slot", False),
             ]
         ],
         "closed_fraction": {"mean": 0.81, "low": 0.7, "high": 0.9},
@@ -278,6 +279,7 @@ def test_the_remainder_is_told_with_its_calibration(examples: dict[str, Any]) ->
     assert "vary smoothly in time" in page.text
     assert "vary from link to link" in page.text
     assert "vary by run" in page.text
+    assert "vary in a cycle of 7 along slot" in page.text
     assert "widens the prediction" in page.text
     assert re.search(r"inside their 90% interval 71% 90% 90%", page.text)
     assert any("Share of what is left" in (svg["aria-label"] or "") for svg in page.all("svg"))

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import numpy as np
 import pytest
 
 from dtprob.gap.closed import ClosedFraction
@@ -58,6 +59,32 @@ def test_no_cause_is_unlisted_where_a_site_is_wrong():
     assert decide(evidence("mean", 1e-6), (), Settings()) == "UNLISTED"
 
 
+def seen(problem, fitted, adjusted):
+    """What `best` looks at: a fit, and the smallest family-wise p-value of the scores there."""
+    screening = SimpleNamespace(adjusted=np.array([0.9, adjusted]))
+    return SimpleNamespace(problem=problem, fitted=fitted, screening=screening)
+
+
+@pytest.mark.parametrize(
+    ("so_far", "adjusted", "gain", "taken"),
+    [
+        (0.0, 0.004, 0.5, True),
+        (0.0, 0.004, -0.5, False),
+        (0.0, 0.02, 6.5, False),
+        (0.0, 0.02, 6.7, True),  # log 40 + 3 = 6.69
+        (200.0, 0.004, 5.0, False),
+        (200.0, 0.004, 7.0, True),
+    ],
+)
+def test_the_choice_among_all_is_paid_by_the_level_or_by_the_evidence(so_far, adjusted, gain, taken):
+    effects = [SimpleNamespace(name=str(i), kind="mean") for i in range(40)]
+    base = SimpleNamespace(effects=(), log_evidence=-1000.0)
+    fitted = SimpleNamespace(effects=("1",), log_evidence=-1000.0 + so_far)
+    trials = {"0": SimpleNamespace(effects=("1", "0"), log_evidence=fitted.log_evidence + gain)}
+    view = seen(SimpleNamespace(effects=effects), fitted, adjusted)
+    assert best(view, base, trials, Settings()) == ("0" if taken else None)
+
+
 @pytest.mark.parametrize(
     ("gained", "chosen"),
     [((20.0, 22.0), "plain"), ((20.0, 24.0), "field"), ((300.0, 308.0), "plain"), ((300.0, 312.0), "field")],
@@ -69,8 +96,7 @@ def test_a_random_field_has_to_be_better_by_a_margin(gained, chosen):
         effect.name: SimpleNamespace(effects=(effect.name,), log_evidence=-1000.0 + gain)
         for effect, gain in zip(effects, gained, strict=True)
     }
-    view = SimpleNamespace(problem=problem, fitted=base)
-    assert best(view, base, trials, Settings()) == chosen
+    assert best(seen(problem, base, 0.5), base, trials, Settings()) == chosen
     assert credit(problem, trials["plain"], base) == trials["plain"].log_evidence
 
 
@@ -86,7 +112,7 @@ def test_several_effects_in_place_of_one_are_an_explanation():
         trials=SimpleNamespace(problem="end", fits={}),
         accepted=None,
     )
-    given = {"held_before": None, "held_after": None, "bracket": (0.0, 0.0), "fraction": None, "shares": ()}
+    given = {"held_before": None, "held_after": None, "floor": None, "fraction": None, "shares": ()}
     found = Evidence(
         problem=None, base=None, steps=(first, end), **given, rivals=(Start("beside", pair),)
     ).explanations
