@@ -25,13 +25,13 @@ def at_least(of: int, rate: float) -> int:
 def studied(
     folder: Path, track: str, kinds: Sequence[str], *, seed: int
 ) -> dict[str, dict[str, tuple[int, int]]]:
-    """One case of each kind in turn at lambda 400, diagnosed and scored.
+    """One case of each kind in turn at lambda 100, diagnosed and scored.
 
     Returns:
         for each kind the counts of its rates, as (count, of).
     """
     study, answers = str(folder / track), str(folder / f"{track}_answers")
-    words = ["--track", track, "--count", str(len(kinds)), "--seed", str(seed), "--lambdas", "400"]
+    words = ["--track", track, "--count", str(len(kinds)), "--seed", str(seed), "--lambdas", "100"]
     assert main(["withheld", "generate", *words, "--kinds", *kinds, "--out", study]) == 0
     assert main(["withheld", "run", f"{study}/cases", "--out", answers, "--workers", "1"]) == 0
     assert main(["withheld", "score", answers, "--key", f"{study}/key.json"]) == 0
