@@ -14,12 +14,11 @@ from dtprob.gap.soundness import broken
 from dtprob.gap.sweep import turned
 
 _PRIOR_DRAWS = 64
-_FINE, _COARSE = 121, 41
-"""Points along a nuisance, and where companions move along."""
+_GRID = 121
 _REACH = 3.0
 _ROUNDS = 5
 _PEAKS = 3
-_MOST = 12
+_MOST = 24
 _SHORT = 4
 _LONG = 3
 _ENOUGH = 3
@@ -119,6 +118,7 @@ def _other_peaks(
     permittivity.
     """
     found: list[tuple[float, np.ndarray]] = []
+    offsets = np.linspace(-_REACH, _REACH, _GRID)
     blocks = [b for b in problem.blocks_of(None) if not b.local]
     for block in (b for b in blocks if along is None or b.name in along):
         plates = problem.declaration.sites[block.name].plates
@@ -128,16 +128,15 @@ def _other_peaks(
             if b is not block and plates and problem.declaration.sites[b.name].plates == plates
         ]
         for j, position in enumerate(block.index[0]):
-            lines, grid = [], _COARSE if others else _FINE
-            offsets = np.linspace(-_REACH, _REACH, grid)
+            lines = []
             for shift in _COMPANION if others else (0.0,):
-                line = np.repeat(x[None], grid, axis=0)
+                line = np.repeat(x[None], _GRID, axis=0)
                 line[:, position] += offsets * scale[position]
                 for other in others:
                     if other.size == block.size:
                         line[:, other.index[0][j]] += shift * scale[other.index[0][j]]
                 lines.append(line)
-            values = problem.compiled.profile(np.concatenate(lines)).reshape(len(lines), grid)
+            values = problem.compiled.profile(np.concatenate(lines)).reshape(len(lines), _GRID)
             found += _peaks(np.where(np.isfinite(values), values, -np.inf), np.stack(lines))
     return [point for _, point in sorted(found, key=lambda f: -f[0])[:_MOST]]
 
@@ -149,7 +148,7 @@ def _peaks(values: np.ndarray, lines: np.ndarray) -> list[tuple[float, np.ndarra
         return []
     padded = np.concatenate([[-np.inf], best, [-np.inf]])
     peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
-    middle = len(best) // 2
+    middle = _GRID // 2
     others = [int(k) for k in peaks if abs(int(k) - middle) > 1]
     near = sorted(others, key=lambda k: abs(k - middle))[:_PEAKS]
     others = sorted({*near, *sorted(others, key=lambda k: -best[k])[:_PEAKS]})
