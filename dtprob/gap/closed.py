@@ -90,8 +90,8 @@ class Floor:
 
     Attributes:
         low, high: bracket of what the causes, with their parameters as they are fitted, and whatever is left could reach.
-        parameters: d of the causes, estimated from the share (K - 1) / K of the clusters.
-        estimation: what not knowing them costs on average, d / 2 K / (K - 1); half a chi-square of d degrees, scaled alike.
+        parameters: d of the causes.
+        estimation: what not knowing them costs on average, see `cost`; half a chi-square of d degrees, scaled alike.
     """
 
     low: float
@@ -131,9 +131,13 @@ def floor(problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: f
         n_folds: K.
     """
     size = sum(e.dimension if e.kind == "mean" else 1 for e in problem.effects if e.name in full.effects)
-    cost = 0.5 * size * n_folds / (n_folds - 1)
     reached = float(after.log_likelihood.sum())
-    return Floor(reached, reached + max(remaining_gain, 0.0), size, cost)
+    return Floor(reached, reached + max(remaining_gain, 0.0), size, cost(size, n_folds))
+
+
+def cost(parameters: float, n_folds: int) -> float:
+    """Nats on held-out clusters that estimating d parameters from the share (K - 1) / K of all costs, d / 2 K / (K - 1)."""
+    return 0.5 * parameters * n_folds / (n_folds - 1)
 
 
 def closed_fraction(

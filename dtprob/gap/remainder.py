@@ -104,7 +104,7 @@ def model_remainder(
     after = closed.judged(wider, parts)
     reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
     size = sum(_determined(wider, full, n) for n in taken)
-    cost = 0.5 * size * len(parts) / (len(parts) - 1)
+    cost = closed.cost(size, len(parts))
     floor = closed.Floor(reached, max(best - cost, reached), size, cost)
     return Remainder(
         tuple(_term(problem, named[n]) for n in taken),
