@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
 from typing import Any, Final
 
 import jax
@@ -11,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
-from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.effect import FIELD, Effect, Parameter
 
 _FEATURES: Final = 16
 """Features, the first ones, whose regions are looked at."""
@@ -21,7 +22,24 @@ _JITTER: Final = 1e-6
 _REACH: Final = 1.0
 """Distance, in standard deviations of the features, at which the errors of an old map have forgotten one another."""
 
-type Weight = Callable[[Any], Float[Array, " sample"]]
+_EDGE: Final = 0.05
+"""Standard deviation of where a region's edge lies, as a share of the feature's range."""
+_SOFT: Final = 2.0
+"""Samples, had they been spread evenly, over which a region's edge is soft, so that its place has a derivative."""
+_DISTINCT: Final = 12
+"""Different values that a feature has at least where a region's edge may lie elsewhere than between two of them."""
+
+type Weight = Callable[[Any, Mapping[str, Any]], Float[Array, " sample"]]
+
+
+@dataclass(frozen=True)
+class _Region:
+    """A region of the features: its instance, what the page says of it, its weight at features, and its own parameters."""
+
+    name: str
+    text: str
+    weight: Weight
+    parameters: tuple[Parameter, ...] = ()
 
 
 def regional_bias(sites: Sites, data: Data) -> list[Effect]:
@@ -29,18 +47,18 @@ def regional_bias(sites: Sites, data: Data) -> list[Effect]:
     if not offers(sites, "predicted_label"):
         return []
     unit = _unit(data)
-    everywhere: tuple[str, str, Weight] = ("everywhere", "everywhere", lambda x: jnp.ones(x.shape[0]))
+    everywhere = _Region("everywhere", "everywhere", lambda x, _: jnp.ones(x.shape[0]))
     return [
         Effect(
             "regional_bias",
-            {"predicted_label": _added(weight)},
-            (normal("bias", unit),),
-            instance=name,
-            physics=f"Labels are higher than predicted {text}, by a constant.",
+            {"predicted_label": _added(region.weight)},
+            (normal("bias", unit), *region.parameters),
+            instance=region.name,
+            physics=f"Labels are higher than predicted {region.text}, by a constant.",
             source="y + b w(x), w of largest value 1.",
             requires=("x",),
         )
-        for name, text, weight in [everywhere, *_regions(data), *_slopes(data)]
+        for region in [everywhere, *_regions(data), *_slopes(data)]
     ]
 
 
@@ -71,21 +89,21 @@ def label_noise(sites: Sites, data: Data) -> list[Effect]:
 
     def louder(weight: Weight) -> Any:
         def widen(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-            return value * jnp.exp(p["log_ratio"] * weight(context["x"]))
+            return value * jnp.exp(p["log_ratio"] * weight(context["x"], p))
 
         return widen
 
     return [
         Effect(
             "label_noise",
-            {"label_deviation": louder(weight)},
-            (normal("log_ratio", 0.7),),
-            instance=name,
-            physics=f"The error's standard deviation is another {text}.",
+            {"label_deviation": louder(region.weight)},
+            (normal("log_ratio", 0.7), *region.parameters),
+            instance=region.name,
+            physics=f"The error's standard deviation is another {region.text}.",
             source="s exp(c w(x)).",
             requires=("x",),
         )
-        for name, text, weight in _regions(data)
+        for region in _regions(data)
     ]
 
 
@@ -152,7 +170,7 @@ def _unit(data: Data) -> float:
 
 def _added(weight: Weight) -> Any:
     def add(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        return value + p["bias"] * weight(context["x"])
+        return value + p["bias"] * weight(context["x"], p)
 
     return add
 
@@ -168,9 +186,12 @@ def _quantiles(column: np.ndarray, parts: int) -> np.ndarray:
     return np.quantile(column, np.arange(1, parts) / parts)
 
 
-def _regions(data: Data) -> list[tuple[str, str, Weight]]:
-    """The lowest, middle and highest third of each feature; of one with two values each of them."""
-    regions: list[tuple[str, str, Weight]] = []
+def _regions(data: Data) -> list[_Region]:
+    """The lowest, middle and highest third of each feature; of one with two values each of them.
+
+    Whoever drew a region did not know the samples' thirds: where a feature takes many values the edges are parameters.
+    """
+    regions: list[_Region] = []
     for index, column in _columns(data):
         low, high = (float(edge) for edge in _quantiles(column, 3))
         places: dict[str, tuple[float, float]] = {
@@ -178,33 +199,61 @@ def _regions(data: Data) -> list[tuple[str, str, Weight]]:
             "middle": (low, high),
             "high": (high, np.inf),
         }
+        many = len(np.unique(column)) >= _DISTINCT
         for name, (first, last) in places.items():
             inside = (column > first) & (column <= last)
             if not inside.any() or inside.all():
                 continue
-
-            def within(
-                x: Any, index: int = index, first: float = first, last: float = last
-            ) -> Float[Array, " sample"]:
-                return ((x[:, index] > first) & (x[:, index] <= last)).astype(float)
-
-            text = (
-                f"where feature {index} is {name} ({column[inside].min():.3g} to {column[inside].max():.3g})"
+            ends = f"({column[inside].min():.3g} to {column[inside].max():.3g})"
+            edges = {"first_edge": first, "last_edge": last} if many else {}
+            spread = _EDGE * float(np.ptp(column))
+            regions.append(
+                _Region(
+                    f"x{index}_{name}",
+                    f"where feature {index} is {name} {ends}",
+                    _soft(index, column, first, last) if many else _hard(index, first, last),
+                    tuple(normal(edge, spread) for edge, place in edges.items() if np.isfinite(place)),
+                )
             )
-            regions.append((f"x{index}_{name}", text, within))
     return regions
 
 
-def _slopes(data: Data) -> list[tuple[str, str, Weight]]:
+def _hard(index: int, first: float, last: float) -> Weight:
+    """1 inside, 0 outside."""
+
+    def within(x: Any, _: Mapping[str, Any]) -> Float[Array, " sample"]:
+        return ((x[:, index] > first) & (x[:, index] <= last)).astype(float)
+
+    return within
+
+
+def _soft(index: int, column: np.ndarray, first: float, last: float) -> Weight:
+    """1 inside, 0 outside, with edges that move and have a derivative."""
+    width = _SOFT / len(column) * float(np.ptp(column))
+
+    def within(x: Any, p: Mapping[str, Any]) -> Float[Array, " sample"]:
+        value, weight = x[:, index], jnp.ones(x.shape[0])
+        if np.isfinite(first):
+            weight = weight * jax.nn.sigmoid((value - first - p["first_edge"]) / width)
+        if np.isfinite(last):
+            weight = weight * jax.nn.sigmoid((last + p["last_edge"] - value) / width)
+        return weight
+
+    return within
+
+
+def _slopes(data: Data) -> list[_Region]:
     """Each feature itself, from -1 at its smallest to 1 at its largest value."""
-    slopes: list[tuple[str, str, Weight]] = []
+    slopes: list[_Region] = []
     for index, column in _columns(data):
         middle, half = float(column.max() + column.min()) / 2, float(np.ptp(column)) / 2
 
-        def along(x: Any, index: int = index, middle: float = middle, half: float = half) -> jax.Array:
+        def along(
+            x: Any, _: Mapping[str, Any], index: int = index, middle: float = middle, half: float = half
+        ) -> jax.Array:
             return (x[:, index] - middle) / half
 
-        slopes.append((f"x{index}_slope", f"in proportion to feature {index}", along))
+        slopes.append(_Region(f"x{index}_slope", f"in proportion to feature {index}", along))
     return slopes
 
 

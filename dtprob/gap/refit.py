@@ -116,7 +116,9 @@ def starting_points(
         fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
         offsets = np.unique(np.concatenate([half, fine, -fine])) * scale[j]
         offsets = offsets[offsets >= 0] if sided[j] else offsets
-        line = np.repeat(x[None], len(offsets), axis=0)
+        # What does nothing beside a null, such as the edge of a region, is looked at beside the one-step estimate.
+        silent = step is not None and step[j] == 0.0
+        line = np.repeat((one_step if silent else x)[None], len(offsets), axis=0)
         line[:, position] += offsets
         lines.append(line)
     values = np.asarray(problem.compiled.profile(np.concatenate([one_step[None], *lines])))

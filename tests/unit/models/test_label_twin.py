@@ -92,6 +92,25 @@ def test_how_the_predictor_errs_is_named(name):
     assert found.causes[0].closed_fraction.mean > 0.5
 
 
+@pytest.mark.parametrize("family", ["label_noise", "regional_bias"])
+def test_a_region_is_found_whose_edge_is_not_at_a_third(family):
+    """Were the edge fixed, the labels between it and the third would look like an effect of its own."""
+    data = rows(n=600, error=0.3)
+    beyond = np.asarray(data["x"])[:, 2] > 0.2
+    rng = np.random.default_rng(8)
+    y = data["y"] + beyond * (0.9 * rng.normal(size=600) if family == "label_noise" else 0.5)
+    data = {**data, "y": y}
+    effects = catalogue(declare(label_twin, data).sites, data)
+    found = diagnose(
+        label_twin, data, effects, key=jax.random.key(1), engine=Laplace(draws=200), settings=SETTINGS
+    )
+    assert found.verdict == "LISTED"
+    assert found.causes[0].effects == (f"{family}[x2_high]",)
+    edge = next(size for size in found.causes[0].size if size.name == "first_edge")
+    third = np.quantile(np.asarray(data["x"])[:, 2], 2 / 3)
+    assert third + edge.mean == pytest.approx(0.2, abs=0.03)
+
+
 def test_a_predictor_without_bias_has_no_gap():
     data = rows(seed=5)
     effects = catalogue(declare(label_twin, data).sites, data)
