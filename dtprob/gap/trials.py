@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Final
 
 import numpy as np
+from scipy.special import gammaln
 
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
@@ -108,7 +109,10 @@ def _together(problem: Problem, names: Sequence[str]) -> Problem:
 
 
 def credit(problem: Problem, fitted: fitting.Fit, base: fitting.Fit) -> float:
-    """Log evidence of a fit, less what each random field has to be better by: it can imitate nearly anything.
+    """Log evidence of a fit, less what its set has to be better by than a single effect.
+
+    There are more sets of several effects than single ones: sets of every size are equally likely at first, and so are
+    those of one size (Scott and Berger 2010). A random field pays besides: it can imitate nearly anything.
 
     Args:
         problem: whose effects were fitted.
@@ -118,7 +122,13 @@ def credit(problem: Problem, fitted: fitting.Fit, base: fitting.Fit) -> float:
     kinds = {e.name: e.kind for e in problem.effects}
     fields = sum(kinds[name] == "variance" for name in fitted.effects)
     gained = fitted.log_evidence - base.log_evidence
-    return fitted.log_evidence - fields * max(_FIELD_NATS, _FIELD_SHARE * gained)
+    sets = _log_sets(len(problem.effects), len(fitted.effects)) - _log_sets(len(problem.effects), 1)
+    return fitted.log_evidence - max(sets, 0.0) - fields * max(_FIELD_NATS, _FIELD_SHARE * gained)
+
+
+def _log_sets(candidates: int, size: int) -> float:
+    """Log of the number of sets of a size."""
+    return float(gammaln(candidates + 1) - gammaln(size + 1) - gammaln(candidates - size + 1))
 
 
 def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:

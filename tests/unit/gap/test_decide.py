@@ -100,6 +100,18 @@ def test_a_random_field_has_to_be_better_by_a_margin(gained, chosen):
     assert credit(problem, trials["plain"], base) == trials["plain"].log_evidence
 
 
+def test_there_are_more_pairs_than_single_effects():
+    effects = [SimpleNamespace(name=str(i), kind="mean") for i in range(41)]
+    problem, base = SimpleNamespace(effects=effects), SimpleNamespace(effects=(), log_evidence=0.0)
+    names = tuple(effect.name for effect in effects)
+    one, two, all_of_them = (
+        credit(problem, SimpleNamespace(effects=names[:size], log_evidence=7.0), base) for size in (1, 2, 41)
+    )
+    assert one == 7.0
+    assert two == pytest.approx(7.0 - np.log(20.0))  # 41 * 40 / 2 pairs, 41 single effects
+    assert all_of_them == 7.0
+
+
 def test_several_effects_in_place_of_one_are_an_explanation():
     def fitted(*names):
         return SimpleNamespace(effects=names)
