@@ -267,21 +267,11 @@ def _moved(value: jax.Array, step: jax.Array, *, positive: bool) -> jax.Array:
 def _redistributed(fn: Any, suspect: Suspect, step: jax.Array) -> Any:
     """An observed distribution with moved location (in standard deviations) or spread (in whitened units)."""
     observed = whiten.observation(fn, jnp.zeros(fn.batch_shape + fn.event_shape), suspect.site)
-    p = dict(observed.parameters)
-    match suspect.family.kind, observed.family:
-        case "spread", "ComplexNormal" | "ComplexStudentT":
-            p["variance"] = p["variance"] * jnp.exp(step)
-        case "spread", _:
-            p["scale"] = p["scale"] * jnp.exp(step / jnp.sqrt(2.0))
-        case _, "ComplexNormal" | "ComplexStudentT":
-            p["loc"] = p["loc"] + step * jnp.sqrt(p["variance"] / 2)
-        case _, "Normal" | "LogNormal" | "StudentT":
-            p["loc"] = p["loc"] + step * p["scale"]
-        case _, "BernoulliLogits":
-            p["logits"] = p["logits"] + step
-        case _, "Poisson":
-            p["rate"] = p["rate"] * jnp.exp(step / jnp.sqrt(p["rate"]))
-        case _:
-            return fn
-    new = whiten.distribution(whiten.Observation(observed.family, p))
-    return new.mask(p["mask"] > 0) if "mask" in p else new
+    found = whiten.moved(observed, step, spread=suspect.family.kind == "spread")
+    if found is None:
+        return fn
+    new = whiten.distribution(found)
+    if "mask" not in found.parameters:
+        return new
+    mask = found.parameters["mask"] > 0
+    return new.mask(mask[..., 0] if new.event_shape else mask)

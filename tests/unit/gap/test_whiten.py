@@ -9,6 +9,7 @@ import pytest
 from dtprob.effects.distributions import ComplexStudentT
 from dtprob.errors import InputError
 from dtprob.gap import whiten
+from dtprob.gap.likelihoods import LIKELIHOODS
 from dtprob.models.complex_normal import ComplexNormal
 
 
@@ -58,6 +59,43 @@ FAMILIES = {
         {"probs": strong(0.3)},
     ),
     "Poisson": (dist.Poisson, {"rate": strong(2.3)}, {"rate": strong(0.6)}),
+    "Laplace": (
+        dist.Laplace,
+        {"loc": strong(-0.3), "scale": strong(0.6)},
+        {"loc": strong(0.7), "scale": strong(0.4)},
+    ),
+    "MultivariateNormal": (
+        lambda loc, scale_tril: dist.MultivariateNormal(loc, scale_tril=scale_tril),
+        {
+            "loc": strong([0.4, -1.0, 0.2]),
+            "scale_tril": strong([[0.7, 0, 0], [0.3, 0.5, 0], [-0.2, 0.4, 0.9]]),
+        },
+        {
+            "loc": strong([0.5, 0.3, -0.4]),
+            "scale_tril": strong([[0.2, 0, 0], [-0.3, 0.1, 0], [0.6, 0.2, -0.3]]),
+        },
+    ),
+    "Exponential": (dist.Exponential, {"rate": strong(2.3)}, {"rate": strong(0.6)}),
+    "Gamma": (
+        dist.Gamma,
+        {"concentration": strong(1.8), "rate": strong(0.7)},
+        {"concentration": strong(0.5), "rate": strong(-0.4)},
+    ),
+    "Weibull": (
+        dist.Weibull,
+        {"scale": strong(1.8), "concentration": strong(2.4)},
+        {"scale": strong(0.5), "concentration": strong(-0.4)},
+    ),
+    "BinomialLogits": (
+        lambda total_count, logits: dist.Binomial(jnp.asarray(total_count, int), logits=logits),
+        {"total_count": strong(9.0), "logits": strong(0.9)},
+        {"total_count": strong(0.0), "logits": strong(0.7)},
+    ),
+    "BinomialProbs": (
+        lambda total_count, probs: dist.Binomial(jnp.asarray(total_count, int), probs=probs),
+        {"total_count": strong(9.0), "probs": strong(0.8)},
+        {"total_count": strong(0.0), "probs": strong(0.3)},
+    ),
     "CategoricalLogits": (
         lambda logits: dist.Categorical(logits=logits),
         {"logits": LOGITS},
@@ -79,22 +117,34 @@ def draws(family, n=COUNT):
 
 def batch(family, values):
     make, parameters, _ = FAMILIES[family]
-    expanded = {k: jnp.broadcast_to(v, (*values.shape, *jnp.shape(v))) for k, v in parameters.items()}
-    return whiten.observation(make(**expanded), values, "y")
+    return whiten.observation(make(**each(parameters, values)), values, "y")
+
+
+def each(parameters, values):
+    """The same parameters for every draw."""
+    return {k: jnp.broadcast_to(v, (len(values), *jnp.shape(v))) for k, v in parameters.items()}
 
 
 def tangent_of(family, values):
-    return {k: jnp.broadcast_to(v, (*values.shape, *jnp.shape(v))) for k, v in FAMILIES[family][2].items()}
+    return each(FAMILIES[family][2], values)
+
+
+def expected_covariance(family, size):
+    if family.startswith("Categorical"):  # one row per class; they sum to zero along sqrt(p)
+        root = np.sqrt(np.asarray(PROBABILITY))
+        return np.eye(size) - np.outer(root, root)
+    if family == "MultivariateNormal":  # the product of two entries is there twice, a half of it each time
+        pairs = [frozenset({i, (i + k) % 3}) for k in (1, 2) for i in range(3)]
+        products = np.array([[0.5 * (one == other) for other in pairs] for one in pairs])
+        return np.block([[np.eye(6), np.zeros((6, 6))], [np.zeros((6, 6)), products]])
+    return np.eye(size)
 
 
 @pytest.mark.parametrize("family", FAMILIES)
 def test_residuals_have_mean_zero_and_unit_covariance(family):
     values = draws(family)
-    rows = np.asarray(whiten.residual(batch(family, values), values))
-    expected = np.eye(len(rows))
-    if family.startswith("Categorical"):  # one row per class; they sum to zero along sqrt(p)
-        root = np.sqrt(np.asarray(PROBABILITY))
-        expected = expected - np.outer(root, root)
+    rows = np.moveaxis(np.asarray(whiten.residual(batch(family, values), values)), 1, -1).reshape(-1, COUNT)
+    expected = expected_covariance(family, len(rows))
     fourth = (rows[:, None] ** 2 * rows[None] ** 2).mean(-1)
     assert np.all(np.abs(rows.mean(1)) < 5 / np.sqrt(COUNT))
     assert np.all(np.abs(np.cov(rows) - expected) < 5 * np.sqrt(fourth / COUNT) + 1e-9)
@@ -107,7 +157,7 @@ def test_score_is_the_slope_of_the_log_density(family):
     score = jnp.sum(
         whiten.residual(batch(family, values), values)
         * whiten.shift(batch(family, values), tangent_of(family, values)),
-        axis=0,
+        axis=(0, *range(2, values.ndim + 1)),
     )
     h = 1e-6 if family != "ComplexStudentT" else 1e-5
 
@@ -203,8 +253,49 @@ def test_samples_follow_the_observation():
 
 
 def test_unknown_distribution_is_refused_by_name():
-    with pytest.raises(InputError, match=r"observed site 'y'.*Gamma"):
-        whiten.observation(dist.Gamma(2.0, 1.0), jnp.ones(()), "y")
+    with pytest.raises(InputError, match=r"observed site 'y'.*Beta"):
+        whiten.observation(dist.Beta(2.0, 1.0), jnp.ones(()), "y")
+
+
+def test_entries_of_a_vector_have_its_density_together():
+    values = draws("MultivariateNormal", 20)
+    make, parameters, _ = FAMILIES["MultivariateNormal"]
+    entries = whiten.log_prob(batch("MultivariateNormal", values), values)
+    assert entries.shape == values.shape
+    np.testing.assert_allclose(entries.sum(-1), make(**parameters).log_prob(values), rtol=1e-10)
+
+
+def test_a_mask_of_whole_vectors():
+    values, mask = draws("MultivariateNormal", 4), jnp.array([True, False, True, False])
+    make, parameters, _ = FAMILIES["MultivariateNormal"]
+    fn = make(**each(parameters, values)).mask(mask)
+    density = whiten.log_prob(whiten.observation(fn, values, "y"), values)
+    np.testing.assert_allclose(density.sum(-1), fn.log_prob(values), rtol=1e-10)
+
+
+MOVES = [
+    (family, spread)
+    for family, known in LIKELIHOODS.items()
+    for spread in (False, True)
+    if (known.respread if spread else known.relocate) is not None and not family.endswith("Logits")
+]
+
+
+@pytest.mark.parametrize(("family", "spread"), MOVES)
+def test_a_move_shifts_one_row_by_its_step(family, spread):
+    observed = batch(family, draws(family, 1))
+    like = jnp.zeros(observed.parameters[LIKELIHOODS[family].parameters[0]].shape, float)
+    step = 0.3 + 0.2 * jnp.arange(like.size).reshape(like.shape)
+
+    def parameters(t):
+        found = whiten.moved(observed, t * step, spread=spread)
+        assert found is not None
+        return found.parameters
+
+    rows = np.asarray(whiten.shift(observed, jax.jvp(parameters, (0.0,), (1.0,))[1]))
+    wanted = np.zeros_like(rows)
+    wanted[whiten.location_rows(family, len(rows)) if spread else 0] = step
+    np.testing.assert_allclose(rows, wanted, atol=1e-6)
 
 
 @pytest.mark.parametrize("logit", [-60.0, 60.0])

@@ -1,0 +1,213 @@
+"""The distributions of observations that a diagnosis knows."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpyro.distributions as dist
+
+from dtprob.effects.distributions import ComplexStudentT
+from dtprob.gap import residuals
+from dtprob.gap.residuals import Parameters
+from dtprob.models.complex_normal import ComplexNormal
+
+type Rows = Callable[[Parameters, Any], jax.Array]
+type Move = Callable[[Parameters, jax.Array], Parameters]
+
+_ROOT_TWO: Final = 2.0**0.5
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """One family of distributions.
+
+    Attributes:
+        make: the NumPyro distribution from its parameters.
+        parameters: names of the parameters, each an attribute of the distribution.
+        residual: (parameters, values) -> rows (component, *shape of the value).
+        shift: (parameters, a change of each) -> what it adds to the rows.
+        located: how many of the rows, the first ones, stand for a location or probability; None for all.
+        relocate: (parameters, step) -> parameters whose first row is shifted by the step; None where that is not possible.
+        respread: the same for the first row that is no location.
+        trailing: axes that a parameter has beyond those of the value.
+        log_prob: elementwise log density, where the distribution's own is not elementwise.
+    """
+
+    make: Callable[..., Any]
+    parameters: tuple[str, ...]
+    residual: Rows
+    shift: Rows
+    located: int | None = None
+    relocate: Move | None = None
+    respread: Move | None = None
+    trailing: Mapping[str, int] = field(default_factory=dict)
+    log_prob: Rows | None = None
+
+
+def _to_loc(scale: str, power: float = 1.0, factor: float = 1.0) -> Move:
+    """Moves a location by steps of its standard deviation."""
+
+    def move(p: Parameters, step: jax.Array) -> Parameters:
+        return {**p, "loc": p["loc"] + step * factor * p[scale] ** power}
+
+    return move
+
+
+def _grown(name: str, rate: Callable[[Parameters], Any] = lambda _: 1.0) -> Move:
+    """Multiplies a positive parameter by exp(step times rate)."""
+
+    def move(p: Parameters, step: jax.Array) -> Parameters:
+        return {**p, name: p[name] * jnp.exp(step * rate(p))}
+
+    return move
+
+
+def _gamma_respread(p: Parameters, step: jax.Array) -> Parameters:
+    """Another concentration at the same mean."""
+    factor = jnp.exp(step / (p["concentration"] * residuals.gamma_spread(p)))
+    return {**p, "concentration": p["concentration"] * factor, "rate": p["rate"] * factor}
+
+
+def _weibull_respread(p: Parameters, step: jax.Array) -> Parameters:
+    """Another concentration, the scale changed so that the first row stays."""
+    change = step * 6.0**0.5 / jnp.pi
+    scale = p["scale"] * jnp.exp((1 - residuals.EULER) * change / p["concentration"])
+    return {**p, "concentration": p["concentration"] * jnp.exp(change), "scale": scale}
+
+
+def _to_logits(p: Parameters, step: jax.Array) -> Parameters:
+    return {**p, "logits": p["logits"] + step}
+
+
+def _binomial(total_count: jax.Array, **chance: Any) -> Any:
+    return dist.Binomial(jnp.asarray(total_count, int), **chance)
+
+
+_COMPLEX: Final[Mapping[str, Any]] = {
+    "located": 2,
+    "relocate": _to_loc("variance", 0.5, 0.5**0.5),
+    "respread": _grown("variance"),
+}
+_SCALED: Final[Mapping[str, Any]] = {
+    "located": 1,
+    "relocate": _to_loc("scale"),
+    "respread": _grown("scale", lambda _: 0.5**0.5),
+}
+_CLASSES: Final[Mapping[str, Any]] = {
+    "residual": residuals.categorical_residual,
+    "shift": residuals.categorical_shift,
+}
+
+LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
+    "ComplexNormal": Likelihood(
+        ComplexNormal,
+        ("loc", "variance"),
+        residuals.complex_normal_residual,
+        residuals.complex_normal_shift,
+        **_COMPLEX,
+    ),
+    "ComplexStudentT": Likelihood(
+        ComplexStudentT,
+        ("loc", "variance", "tail"),
+        residuals.complex_student_residual,
+        residuals.complex_student_shift,
+        **_COMPLEX,
+    ),
+    "Normal": Likelihood(
+        dist.Normal, ("loc", "scale"), residuals.normal_residual, residuals.normal_shift, **_SCALED
+    ),
+    "LogNormal": Likelihood(
+        dist.LogNormal, ("loc", "scale"), residuals.log_normal_residual, residuals.normal_shift, **_SCALED
+    ),
+    "StudentT": Likelihood(
+        dist.StudentT,
+        ("loc", "scale", "df"),
+        residuals.student_residual,
+        residuals.student_shift,
+        located=1,
+        relocate=lambda p, step: _to_loc("scale")(p, step * jnp.sqrt((p["df"] + 3) / (p["df"] + 1))),
+        respread=_grown("scale", lambda p: jnp.sqrt((p["df"] + 3) / (2 * p["df"]))),
+    ),
+    "Laplace": Likelihood(
+        dist.Laplace,
+        ("loc", "scale"),
+        residuals.laplace_residual,
+        residuals.laplace_shift,
+        located=1,
+        relocate=_to_loc("scale"),
+        respread=_grown("scale"),
+    ),
+    "MultivariateNormal": Likelihood(
+        lambda loc, scale_tril: dist.MultivariateNormal(loc, scale_tril=scale_tril),
+        ("loc", "scale_tril"),
+        residuals.multivariate_normal_residual,
+        residuals.multivariate_normal_shift,
+        located=1,
+        relocate=lambda p, step: {**p, "loc": p["loc"] + jnp.einsum("...ij,...j", p["scale_tril"], step)},
+        respread=lambda p, step: {
+            **p,
+            "scale_tril": p["scale_tril"] * jnp.exp(step / _ROOT_TWO)[..., None, :],
+        },
+        trailing={"scale_tril": 1},
+        log_prob=residuals.multivariate_normal_log_prob,
+    ),
+    "Exponential": Likelihood(
+        dist.Exponential,
+        ("rate",),
+        residuals.exponential_residual,
+        residuals.exponential_shift,
+        relocate=_grown("rate", lambda _: -1.0),
+    ),
+    "Gamma": Likelihood(
+        dist.Gamma,
+        ("concentration", "rate"),
+        residuals.gamma_residual,
+        residuals.gamma_shift,
+        located=1,
+        relocate=_grown("rate", lambda p: -(p["concentration"] ** -0.5)),
+        respread=_gamma_respread,
+    ),
+    "Weibull": Likelihood(
+        dist.Weibull,
+        ("scale", "concentration"),
+        residuals.weibull_residual,
+        residuals.weibull_shift,
+        located=1,
+        relocate=_grown("scale", lambda p: 1 / p["concentration"]),
+        respread=_weibull_respread,
+    ),
+    "Poisson": Likelihood(
+        dist.Poisson,
+        ("rate",),
+        residuals.poisson_residual,
+        residuals.poisson_shift,
+        relocate=_grown("rate", lambda p: p["rate"] ** -0.5),
+    ),
+    "BernoulliLogits": Likelihood(
+        lambda logits: dist.Bernoulli(logits=logits),
+        ("logits",),
+        residuals.bernoulli_residual,
+        residuals.bernoulli_shift,
+        relocate=_to_logits,
+    ),
+    "BernoulliProbs": Likelihood(dist.Bernoulli, ("probs",), residuals.probs_residual, residuals.probs_shift),
+    "BinomialLogits": Likelihood(
+        _binomial,
+        ("total_count", "logits"),
+        residuals.binomial_residual,
+        residuals.binomial_shift,
+        relocate=_to_logits,
+    ),
+    "BinomialProbs": Likelihood(
+        _binomial, ("total_count", "probs"), residuals.probs_residual, residuals.probs_shift
+    ),
+    "CategoricalLogits": Likelihood(
+        lambda logits: dist.Categorical(logits=logits), ("logits",), **_CLASSES, trailing={"logits": 1}
+    ),
+    "CategoricalProbs": Likelihood(dist.Categorical, ("probs",), **_CLASSES, trailing={"probs": 1}),
+}
+"""By the name of the distribution's class."""
