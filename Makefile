@@ -10,7 +10,7 @@ demo: setup
 	$(BIN)/dtprob demo --out out/demo
 
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0
+	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 --durations 60 --durations-min 5
 
 lint: setup
 	$(BIN)/ruff check .
