@@ -84,7 +84,7 @@ def _ready(case: Case, job: Run, results: Sequence[str]) -> tuple[Prepared, Post
     if prepared.reference is None:
         return prepared, None
     job.say("learning the twin from the reference data")
-    return prepared, infer(prepared, prepared.reference, job.out / "reference.nc", job)
+    return prepared, infer(prepared, prepared.reference, job.out / "reference.nc", job, latents_only=True)
 
 
 def _settings(prepared: Prepared) -> Settings:

@@ -85,7 +85,9 @@ def prepare_case(case: Case, run: Run, need: Literal["fit", "diagnosis"], result
     return prepared
 
 
-def infer(prepared: Prepared, data: Mapping[str, Any], file: Path, run: Run) -> Posterior:
+def infer(
+    prepared: Prepared, data: Mapping[str, Any], file: Path, run: Run, *, latents_only: bool = False
+) -> Posterior:
     """The posterior given some data, kept in a file so that an interrupted run need not begin again.
 
     Args:
@@ -93,6 +95,7 @@ def infer(prepared: Prepared, data: Mapping[str, Any], file: Path, run: Run) -> 
         data: the model's arguments.
         file: where to keep the posterior; beside it lie, while it is being made, a checkpoint and a status.
         run: whether to resume, and how to tell the progress.
+        latents_only: keep draws of what is unknown, and nothing that has an entry for each row of the data.
     """
     identity = file.with_suffix(".identity")
     if run.resume and file.is_file() and _read(identity) == _identity(prepared, file):
@@ -100,7 +103,12 @@ def infer(prepared: Prepared, data: Mapping[str, Any], file: Path, run: Run) -> 
         return Posterior.load(file)
     checkpoint, status = file.with_suffix(".checkpoint"), file.with_suffix(".status.json")
     options = RunOptions(
-        progress=True, status_file=status, checkpoint=checkpoint, resume=run.resume and checkpoint.is_file()
+        progress=True,
+        status_file=status,
+        checkpoint=checkpoint,
+        resume=run.resume and checkpoint.is_file(),
+        deterministics=not latents_only,
+        pointwise=not latents_only,
     )
     run.say(f"fitting with {prepared.engine.name}")
     posterior = prepared.engine(prepared.key, prepared.model, data, options=options)

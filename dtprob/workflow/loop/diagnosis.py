@@ -10,6 +10,7 @@ from dtprob.effects import catalogue
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.trials import Say
 from dtprob.inference import Exact, Laplace
+from dtprob.inference.engine import RunOptions
 from dtprob.models.declaration import declare
 from dtprob.models.multi_access import multi_access, records
 from dtprob.workflow.loop.knowledge import log_of
@@ -38,7 +39,8 @@ def diagnosed(case: TwinCase, state: State, key: jax.Array, say: Say) -> dict[st
         _arguments(case, state, *rows) for rows in ((state.since, state.changed), (state.changed, None))
     )
     first, second = jax.random.split(key)
-    reference = Exact()(first, multi_access, before)
+    latents_only = RunOptions(deterministics=False, pointwise=False)
+    reference = Exact()(first, multi_access, before, options=latents_only)
     sites = declare(multi_access, after).sites
     use = case.effects.use
     offered = catalogue(sites, after, use=use if isinstance(use, str) else list(use))

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from dtprob.case import load_case
+from dtprob.commands.run import Run, infer
 from dtprob.data import write
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.settings import Settings
+from dtprob.models.declaration import declare
 from dtprob.workflow import prepare
 from dtprob.workflow.summary import summarise
 from tests.small_network import simulate
@@ -67,6 +69,18 @@ def test_a_disconnected_device_is_named(folder):
     assert found["verdict"] == "LISTED"
     assert found["causes"][0]["effects"] == ["device_disconnected[device_1]"]
     assert found["causes"][0]["size"]["loss"]["low"] > 1.0
+
+
+def test_of_reference_data_the_unknowns_are_kept_and_nothing_for_each_slot(folder, tmp_path):
+    prepared = prepare(case(folder), need="diagnosis")
+    run = Run(tmp_path, resume=False, allow_code=False, say=lambda _: None)
+    sizes = {
+        only: infer(prepared, prepared.reference, tmp_path / f"{only}.nc", run, latents_only=only)
+        for only in (True, False)
+    }
+    assert set(sizes[True].draws) == set(declare(prepared.model, prepared.reference).latent)
+    assert set(sizes[False].draws) > set(sizes[True].draws)
+    assert (tmp_path / "True.nc").stat().st_size < (tmp_path / "False.nc").stat().st_size / 20
 
 
 @pytest.mark.parametrize(
