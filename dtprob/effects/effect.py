@@ -40,12 +40,15 @@ class Parameter:
         prior: which sizes are plausible; the event and batch shape are the parameter's shape.
         null: the value at which the model is unchanged, the same for every entry.
         unit: SI unit as text, "1" for a pure number.
+        is_place: whether it says where an effect acts, such as the edge of a region, and not how much: it does nothing as
+            long as the effect's sizes are at their null, and its prior holds as it stands, however small the effect.
     """
 
     name: str
     prior: dist.Distribution
     null: float = 0.0
     unit: str = "1"
+    is_place: bool = False
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -9,6 +9,7 @@ from typing import Any, Final
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 from jaxtyping import Array, Float
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
@@ -21,13 +22,12 @@ _POINTS: Final = 64
 _JITTER: Final = 1e-6
 _REACH: Final = 1.0
 """Distance, in standard deviations of the features, at which the errors of an old map have forgotten one another."""
-
 _EDGE: Final = 0.05
-"""Standard deviation of where a region's edge lies, as a share of the feature's range."""
-_SOFT: Final = 2.0
-"""Samples, had they been spread evenly, over which a region's edge is soft, so that its place has a derivative."""
-_DISTINCT: Final = 12
-"""Different values that a feature has at least where a region's edge may lie elsewhere than between two of them."""
+"""Standard deviation of where a region's edge lies, as a share of the samples."""
+_SOFT: Final = 1.0
+"""Samples, or different values, over which a region's edge is soft, so that its place has a derivative."""
+_SMOOTH: Final = 64
+"""Samples that one value of a feature is shared by at most once in so many, where a region's edge may move."""
 
 type Weight = Callable[[Any, Mapping[str, Any]], Float[Array, " sample"]]
 
@@ -199,22 +199,20 @@ def _regions(data: Data) -> list[_Region]:
             "middle": (low, high),
             "high": (high, np.inf),
         }
-        many = len(np.unique(column)) >= _DISTINCT
+        is_smooth = np.unique(column, return_counts=True)[1].max() <= len(column) / _SMOOTH
         for name, (first, last) in places.items():
             inside = (column > first) & (column <= last)
             if not inside.any() or inside.all():
                 continue
             ends = f"({column[inside].min():.3g} to {column[inside].max():.3g})"
-            edges = {"first_edge": first, "last_edge": last} if many else {}
-            spread = _EDGE * float(np.ptp(column))
-            regions.append(
-                _Region(
-                    f"x{index}_{name}",
-                    f"where feature {index} is {name} {ends}",
-                    _soft(index, column, first, last) if many else _hard(index, first, last),
-                    tuple(normal(edge, spread) for edge, place in edges.items() if np.isfinite(place)),
+            if is_smooth:
+                weight, parameters = _soft(
+                    index, column, bool(np.isfinite(first)), bool(np.isfinite(last)), inside
                 )
-            )
+            else:
+                weight, parameters = _hard(index, first, last), ()
+            text = f"where feature {index} is {name} {ends}"
+            regions.append(_Region(f"x{index}_{name}", text, weight, parameters))
     return regions
 
 
@@ -227,19 +225,31 @@ def _hard(index: int, first: float, last: float) -> Weight:
     return within
 
 
-def _soft(index: int, column: np.ndarray, first: float, last: float) -> Weight:
-    """1 inside, 0 outside, with edges that move and have a derivative."""
-    width = _SOFT / len(column) * float(np.ptp(column))
+def _soft(
+    index: int, column: np.ndarray, is_above: bool, is_below: bool, inside: np.ndarray
+) -> tuple[Weight, tuple[Parameter, ...]]:
+    """1 inside, 0 outside, with edges that move and have a derivative: parameters, as quantiles of the feature."""
+    values = np.unique(column)
+    quantiles = (np.arange(len(values)) + 0.5) / len(values)
+    width = _SOFT / len(values)
+    half = 0.5 / len(values)
+    within = np.interp(column[inside], values, quantiles)
+    ends = {"from_quantile": (is_above, within.min() - half), "to_quantile": (is_below, within.max() + half)}
+    parameters = tuple(
+        Parameter(name, dist.Normal(float(place), _EDGE), float(place), is_place=True)
+        for name, (is_end, place) in ends.items()
+        if is_end
+    )
 
-    def within(x: Any, p: Mapping[str, Any]) -> Float[Array, " sample"]:
-        value, weight = x[:, index], jnp.ones(x.shape[0])
-        if np.isfinite(first):
-            weight = weight * jax.nn.sigmoid((value - first - p["first_edge"]) / width)
-        if np.isfinite(last):
-            weight = weight * jax.nn.sigmoid((last + p["last_edge"] - value) / width)
-        return weight
+    def weight(x: Any, p: Mapping[str, Any]) -> Float[Array, " sample"]:
+        quantile, inside = jnp.interp(x[:, index], values, quantiles), jnp.ones(x.shape[0])
+        if is_above:
+            inside = inside * jax.nn.sigmoid((quantile - p["from_quantile"]) / width)
+        if is_below:
+            inside = inside * jax.nn.sigmoid((p["to_quantile"] - quantile) / width)
+        return inside
 
-    return within
+    return weight, parameters
 
 
 def _slopes(data: Data) -> list[_Region]:

@@ -18,7 +18,7 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.gap.active import LOG_2PI, Active, activate, basis, effect_prior
 from dtprob.gap.newton import NewtonStep, System, local_step, newton_step, positive
-from dtprob.gap.plausible import mixing_gain, nulls, scales, sides
+from dtprob.gap.plausible import mixing_gain, nulls, places, scales, sides
 from dtprob.gap.problem import Problem
 from dtprob.gap.sweep import swept
 
@@ -263,7 +263,8 @@ def _mixed(problem: Problem, active: Active, x: np.ndarray, covariance: np.ndarr
     index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
     place = np.ix_(*[[int(np.flatnonzero(active.global_index == i)[0]) for i in index]] * 2)
     sided = bool(sides(effect).all()) and len(index) == 1
-    return mixing_gain(covariance[place], x[index] - nulls(effect), scales(effect), one_sided=sided)
+    moved = x[index] - nulls(effect)
+    return mixing_gain(covariance[place], moved, scales(effect), one_sided=sided, places=places(effect))
 
 
 def settled(problem: Problem, fitted: Fit) -> Fit:

@@ -48,6 +48,7 @@ def mixing_gain(
     scale: Float[np.ndarray, " n"],
     *,
     one_sided: bool = False,
+    places: Bool[np.ndarray, " n"] | None = None,
 ) -> float:
     """What mixing the prior's scale adds to a log evidence that was computed at its largest.
 
@@ -56,11 +57,16 @@ def mixing_gain(
         estimate: the posterior mode less the null.
         scale: the prior's standard deviations.
         one_sided: of a single parameter that cannot be below its null.
+        places: parameters whose prior is not mixed; none by default.
     """
     precision = np.linalg.inv(covariance / np.outer(scale, scale))
     information = precision - np.eye(len(scale))
     unit, score = np.ones(len(scale)), precision @ (estimate / scale)
-    terms = _terms(information, score, unit, np.array([*SCALES, 1.0]), one_sided)
+    shares = np.array([*SCALES, 1.0])
+    if places is not None and places.any():
+        terms = _terms_with_places(information, score, shares, places)
+    else:
+        terms = _terms(information, score, unit, shares, one_sided)
     return float(special.logsumexp(terms[:-1]) - np.log(len(SCALES)) - terms[-1])
 
 
@@ -76,6 +82,17 @@ def _terms(
         above = (score * scale)[0] * scales / np.sqrt(spread[:, 0])
         terms = terms + np.log(2.0) + special.log_ndtr(above)
     return terms
+
+
+def _terms_with_places(
+    information: np.ndarray, score: np.ndarray, shares: np.ndarray, places: np.ndarray
+) -> np.ndarray:
+    """The log Bayes factor at each share of the prior's scale, here 1, that of places left as it is."""
+    scale = np.where(places, 1.0, shares[:, None])
+    spread = np.eye(len(score)) + scale[:, :, None] * information * scale[:, None, :]
+    u = scale * score
+    gained = np.einsum("si,si->s", u, np.linalg.solve(spread, u[..., None])[..., 0])
+    return 0.5 * (gained - np.linalg.slogdet(spread)[1])
 
 
 def prior_scale(prior: object) -> np.ndarray:
@@ -100,6 +117,11 @@ def nulls(effect: Effect) -> Float[np.ndarray, " n"]:
 def sides(effect: Effect) -> Bool[np.ndarray, " n"]:
     """Which of an effect's parameters cannot be below their null, flat."""
     return _flat(effect, [p.is_one_sided for p in effect.parameters])
+
+
+def places(effect: Effect) -> Bool[np.ndarray, " n"]:
+    """Which of an effect's parameters say where it acts, flat."""
+    return _flat(effect, [p.is_place for p in effect.parameters])
 
 
 def _flat(effect: Effect, values: Sequence[ArrayLike]) -> np.ndarray:

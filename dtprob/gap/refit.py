@@ -9,7 +9,7 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
 from dtprob.gap.base import polish
-from dtprob.gap.plausible import nulls, scales, sides
+from dtprob.gap.plausible import nulls, places, scales, sides
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.sweep import swept
@@ -110,30 +110,45 @@ def starting_points(
     if step is not None:
         moved = np.clip(step, -4 * scale, 4 * scale)
         one_step[index] += np.where(sided, np.maximum(moved, 1e-3 * scale), moved)
-    lines = []
-    for j, position in enumerate(index[:_LINES]):
-        half = np.linspace(-2.5, 2.5, 2 * settings.grid + 1)
-        fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
-        offsets = np.unique(np.concatenate([half, fine, -fine])) * scale[j]
-        offsets = offsets[offsets >= 0] if sided[j] else offsets
-        # What does nothing beside a null, such as the edge of a region, is looked at beside the one-step estimate.
-        silent = step is not None and step[j] == 0.0
-        line = np.repeat((one_step if silent else x)[None], len(offsets), axis=0)
+    local = places(effect)[:_LINES]
+    sizes = [(int(i), float(scale[j]), bool(sided[j])) for j, i in enumerate(index[:_LINES]) if not local[j]]
+    reached, peaks = _along(problem, one_step, x, sizes, settings)
+    if local.any():  # they do nothing beside the null, so they are looked at beside the best size
+        best = max([(reached, one_step), *peaks], key=lambda b: b[0])[1]
+        edges = [(int(i), float(scale[j]), False) for j, i in enumerate(index[:_LINES]) if local[j]]
+        peaks += _along(problem, best, best, edges, settings)[1]
+    ordered = sorted(peaks, key=lambda b: -b[0])[: settings.starts]
+    floor = reached if len(ordered) else -np.inf
+    near = [start for value, start in ordered if value > floor - 5.0]
+    return [one_step, *near, *_large(problem, x, effect, settings.starts)]
+
+
+def _along(
+    problem: Problem,
+    point: np.ndarray,
+    x: np.ndarray,
+    lines: Sequence[tuple[int, float, bool]],
+    settings: Settings,
+) -> tuple[float, list[tuple[float, np.ndarray]]]:
+    """The log posterior at a point, and the local maxima on lines through x: position, scale, and whether one-sided."""
+    half = np.linspace(-2.5, 2.5, 2 * settings.grid + 1)
+    fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
+    steps = np.unique(np.concatenate([half, fine, -fine]))
+    trials = []
+    for position, scale, sided in lines:
+        offsets = steps[steps >= 0] * scale if sided else steps * scale
+        line = np.repeat(x[None], len(offsets), axis=0)
         line[:, position] += offsets
-        lines.append(line)
-    values = np.asarray(problem.compiled.profile(np.concatenate([one_step[None], *lines])))
-    best = [(float(values[0]), one_step)]
-    low = 1
-    for line in lines:
+        trials.append(line)
+    values = np.asarray(problem.compiled.profile(np.concatenate([point[None], *trials])))
+    peaks, low = [], 1
+    for line in trials:
         v = values[low : low + len(line)]
         low += len(line)
         padded = np.concatenate([[-np.inf], np.where(np.isfinite(v), v, -np.inf), [-np.inf]])
-        peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
-        best += [(float(v[k]), line[k]) for k in peaks]
-    ordered = sorted(best[1:], key=lambda b: -b[0])[: settings.starts]
-    floor = values[0] if len(ordered) else -np.inf
-    near = [start for value, start in ordered if value > floor - 5.0]
-    return [one_step, *near, *_large(problem, x, effect, settings.starts)]
+        tops = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+        peaks += [(float(v[k]), line[k]) for k in tops]
+    return float(values[0]), peaks
 
 
 def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[np.ndarray]:

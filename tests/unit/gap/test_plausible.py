@@ -80,3 +80,17 @@ def test_flat_sizes_of_an_effect():
     np.testing.assert_allclose(scales(effect), [0.3, 2.0, 2.0])
     np.testing.assert_allclose(nulls(effect), 0.0)
     np.testing.assert_array_equal(sides(effect), [True, False, False])
+
+
+def test_the_prior_of_a_place_is_not_mixed():
+    """Where sizes and places say nothing of one another, what is gained is what the sizes alone gain."""
+    scale, estimate = np.array([2.0, 0.3, 0.05]), np.array([0.02, 0.1, -0.04])
+    covariance = np.diag(np.array([0.01, 0.05, 0.03]) ** 2)
+    places = np.array([False, False, True])
+    both = mixing_gain(covariance, estimate, scale, places=places)
+    sizes = mixing_gain(covariance[:2, :2], estimate[:2], scale[:2])
+    np.testing.assert_allclose(both, sizes, rtol=1e-10)
+    assert mixing_gain(covariance, estimate, scale) != pytest.approx(both, abs=0.1)
+    np.testing.assert_allclose(
+        mixing_gain(covariance, estimate, scale, places=~np.zeros(3, bool)), 0.0, atol=1e-10
+    )

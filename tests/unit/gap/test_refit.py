@@ -6,7 +6,8 @@ import numpy as np
 from dtprob.effects import catalogue
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
-from dtprob.gap.refit import refit
+from dtprob.gap.refit import refit, starting_points
+from dtprob.gap.settings import Settings
 from dtprob.models.declaration import declare
 from dtprob.models.label_twin import label_twin
 
@@ -25,3 +26,20 @@ def test_a_field_whose_unit_is_small_is_found():
     found = refit(problem, base, effects[0], [])
     assert 1.5 < found.spread["stale_map"] < 5.0
     assert found.log_evidence > base.log_evidence + 10
+
+
+def test_edges_are_looked_for_beside_the_best_size():
+    """A bias in the upper 44% of a feature; beside no bias the edge of the upper third says nothing."""
+    rng = np.random.default_rng(4)
+    x = rng.uniform(size=(300, 1))
+    prediction = rng.standard_normal(300)
+    y = prediction + 1.0 * (x[:, 0] > 0.56) + 0.3 * rng.standard_normal(300)
+    data = {"x": jnp.asarray(x), "prediction": jnp.asarray(prediction), "y": jnp.asarray(y)}
+    effects = catalogue(declare(label_twin, data).sites, data, use="regional_bias[x0_high]")
+    problem = Problem(label_twin, data, effects).with_live(["regional_bias[x0_high]"])
+    base = fitting.fit(problem, problem.null())
+    starts = starting_points(problem, base.x, effects[0], None, Settings())
+    edge = problem.layout["regional_bias[x0_high].from_quantile"].index[0]
+    assert min(abs(start[edge].item() - 0.56) for start in starts) < 0.06
+    found = refit(problem, base, effects[0], starts)
+    np.testing.assert_allclose(found.x[edge], np.mean(x[:, 0] <= 0.56), atol=0.01)

@@ -106,9 +106,35 @@ def test_a_region_is_found_whose_edge_is_not_at_a_third(family):
     )
     assert found.verdict == "LISTED"
     assert found.causes[0].effects == (f"{family}[x2_high]",)
-    edge = next(size for size in found.causes[0].size if size.name == "first_edge")
-    third = np.quantile(np.asarray(data["x"])[:, 2], 2 / 3)
-    assert third + edge.mean == pytest.approx(0.2, abs=0.03)
+    edge = next(size for size in found.causes[0].size if size.name == "from_quantile")
+    assert edge.mean == pytest.approx(np.mean(~beyond), abs=0.015)
+
+
+def test_regions_of_few_values_or_skewed_features_are_whole():
+    """Weight 1 inside and 0 outside, but for a few samples at edges that may move."""
+    rng = np.random.default_rng(3)
+    x = np.stack(
+        [
+            rng.integers(1, 13, 600),
+            np.where(rng.uniform(size=600) < 0.7, 0.0, rng.normal(size=600)),
+            rng.lognormal(0, 3, 600),
+            np.repeat(rng.uniform(size=100), 6),
+        ],
+        axis=1,
+    )
+    data = {"x": jnp.asarray(x), "prediction": jnp.asarray(rng.normal(size=600))}
+    effects = catalogue(
+        declare(label_twin, {**data, "y": data["prediction"]}).sites, data, use="regional_bias"
+    )
+    regions = [e for e in effects if (e.instance or "").endswith(("low", "middle", "high"))]
+    assert {e.instance for e in regions if len(e.parameters) > 1} == {
+        f"{feature}_{place}" for feature in ("x2", "x3") for place in ("low", "middle", "high")
+    }
+    for effect in regions:
+        parameters = {**effect.null(), "bias": 1.0}
+        moved = effect.rewrites["predicted_label"](data["prediction"], parameters, data) - data["prediction"]
+        assert np.mean((np.asarray(moved) > 0.02) & (np.asarray(moved) < 0.98)) < 0.2
+        assert np.max(moved) == pytest.approx(1.0, abs=0.01)
 
 
 def test_a_predictor_without_bias_has_no_gap():
