@@ -17,13 +17,10 @@ from scipy import stats
 from dtprob.gap.active import activate, basis
 from dtprob.gap.closed import Fold
 from dtprob.gap.fit import Fit
+from dtprob.gap.likelihoods import LIKELIHOODS
 from dtprob.gap.newton import positive
 from dtprob.gap.problem import Problem
 
-_SCALE_ROW: Final = {"ComplexNormal": 0.5, "Normal": 0.5**0.5, "LogNormal": 0.5**0.5}
-"""Families whose whitened residuals are normal, and the logarithm of their scale for a unit step of their last row."""
-_OUTCOMES: Final = frozenset({"BernoulliLogits", "BernoulliProbs", "CategoricalLogits", "CategoricalProbs"})
-"""Families of which one of a few outcomes is seen."""
 _WIDEST: Final = 2.0
 """Log spread beyond which the noise's own spread is not followed."""
 _LEVEL: Final = 0.9
@@ -36,7 +33,7 @@ class Calibration:
     """Predicted against actual errors, on clusters that were left out.
 
     Attributes:
-        coverage: share of observed entries inside their 90% predictive interval; None where entries are discrete.
+        coverage: share of observed entries inside their 90% predictive interval; None where not all are normal.
         error_ratio: root mean square of errors over predicted standard deviations, 1 if they are right; None where outcomes
             are observed. The probability p of an outcome says how much it varies, p (1 - p), however uncertain p itself is:
             outcomes one by one vary no more where a gap is, and no less than predicted once it is allowed for (McCullagh
@@ -64,8 +61,9 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
         inside.append(np.abs(scaled) <= _reach(swing))
         squares.append(scaled**2 * np.exp(-2 * swing**2))
         families |= {o.family for o in problem.compiled.observations(part.x).values()}
-    coverage = float(np.concatenate(inside).mean()) if families <= set(_SCALE_ROW) else None
-    ratio = None if families & _OUTCOMES else float(np.sqrt(np.concatenate(squares).mean()))
+    known = [LIKELIHOODS[family] for family in families]
+    coverage = None if any(f.log_scale is None for f in known) else float(np.concatenate(inside).mean())
+    ratio = None if any(f.is_outcome for f in known) else float(np.sqrt(np.concatenate(squares).mean()))
     return Calibration(coverage, ratio)
 
 
@@ -120,8 +118,12 @@ def _swing(problem: Problem, part: Fit, unknown: np.ndarray, held: np.ndarray) -
         size = count * int(np.prod(shape, dtype=int))
         own = flat[start : start + size].reshape(count, *shape)
         start += size
-        scale = _SCALE_ROW.get(observation.family)
-        swing = np.zeros_like(own) if scale is None else np.broadcast_to(scale * np.sqrt(own[-1:]), own.shape)
+        scale, spread = LIKELIHOODS[observation.family].log_scale, problem.located[name]
+        swing = (
+            np.zeros_like(own)
+            if scale is None
+            else np.broadcast_to(scale * np.sqrt(own[spread : spread + 1]), own.shape)
+        )
         found[name] = jnp.asarray(swing)
     return np.minimum(np.asarray(problem.rows.stack(found))[held], _WIDEST)
 

@@ -161,11 +161,10 @@ def _distribution_tangents(
             fn = rewrite(
                 whiten.distribution(around.observations[site]), unflatten(effect, flat), around.context
             )
-            return whiten.observation(fn, value, site).parameters
+            return whiten.rewritten(around.observations[site], fn, value, site).parameters
 
-        new = whiten.observation(
-            rewrite(whiten.distribution(observation), effect.null(), around.context), value, site
-        )
+        moved = rewrite(whiten.distribution(observation), effect.null(), around.context)
+        new = whiten.rewritten(observation, moved, value, site)
         shifts = []
         for j, basis in enumerate(jnp.eye(len(null))):
             shift = whiten.shift(new, jax.jvp(parameters, (null,), (basis,))[1])

@@ -19,6 +19,8 @@ type Rows = Callable[[Parameters, Any], jax.Array]
 type Move = Callable[[Parameters, jax.Array], Parameters]
 
 _ROOT_TWO: Final = 2.0**0.5
+_CERTAIN: Final = 0.05
+"""Standard deviation of an outcome below which it is nearly certain."""
 
 
 @dataclass(frozen=True)
@@ -33,8 +35,10 @@ class Likelihood:
         located: how many of the rows, the first ones, stand for a location or probability; None for all.
         relocate: (parameters, step) -> parameters whose first row is shifted by the step; None where that is not possible.
         respread: the same for the first row that is no location.
+        log_scale: of families whose first rows are normal, the logarithm of the scale for a unit step of that row.
+        is_outcome: whether one of a few outcomes is seen.
         trailing: axes that a parameter has beyond those of the value.
-        log_prob: elementwise log density, where the distribution's own is not elementwise.
+        log_prob: log density of each entry given those before it, where the entries of the last axis are one vector.
     """
 
     make: Callable[..., Any]
@@ -44,15 +48,17 @@ class Likelihood:
     located: int | None = None
     relocate: Move | None = None
     respread: Move | None = None
+    log_scale: float | None = None
+    is_outcome: bool = False
     trailing: Mapping[str, int] = field(default_factory=dict)
     log_prob: Rows | None = None
 
 
-def _to_loc(scale: str, power: float = 1.0, factor: float = 1.0) -> Move:
-    """Moves a location by steps of its standard deviation."""
+def _to_loc(deviation: Callable[[Parameters], jax.Array]) -> Move:
+    """Moves a location by steps of a deviation."""
 
     def move(p: Parameters, step: jax.Array) -> Parameters:
-        return {**p, "loc": p["loc"] + step * factor * p[scale] ** power}
+        return {**p, "loc": p["loc"] + step * deviation(p)}
 
     return move
 
@@ -80,26 +86,24 @@ def _weibull_respread(p: Parameters, step: jax.Array) -> Parameters:
 
 
 def _to_logits(p: Parameters, step: jax.Array) -> Parameters:
-    return {**p, "logits": p["logits"] + step}
+    """Logits that shift the row by the step; less far where the outcome is nearly certain."""
+    return {**p, "logits": p["logits"] + step / jnp.maximum(residuals.logits_deviation(p), _CERTAIN)}
 
 
 def _binomial(total_count: jax.Array, **chance: Any) -> Any:
     return dist.Binomial(jnp.asarray(total_count, int), **chance)
 
 
-_COMPLEX: Final[Mapping[str, Any]] = {
-    "located": 2,
-    "relocate": _to_loc("variance", 0.5, 0.5**0.5),
-    "respread": _grown("variance"),
-}
 _SCALED: Final[Mapping[str, Any]] = {
     "located": 1,
-    "relocate": _to_loc("scale"),
+    "relocate": _to_loc(lambda p: p["scale"]),
     "respread": _grown("scale", lambda _: 0.5**0.5),
+    "log_scale": 0.5**0.5,
 }
 _CLASSES: Final[Mapping[str, Any]] = {
     "residual": residuals.categorical_residual,
     "shift": residuals.categorical_shift,
+    "is_outcome": True,
 }
 
 LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
@@ -108,14 +112,21 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         ("loc", "variance"),
         residuals.complex_normal_residual,
         residuals.complex_normal_shift,
-        **_COMPLEX,
+        located=2,
+        relocate=_to_loc(lambda p: jnp.sqrt(p["variance"] / 2)),
+        respread=_grown("variance"),
+        log_scale=0.5,
     ),
     "ComplexStudentT": Likelihood(
         ComplexStudentT,
         ("loc", "variance", "tail"),
         residuals.complex_student_residual,
         residuals.complex_student_shift,
-        **_COMPLEX,
+        located=2,
+        relocate=_to_loc(
+            lambda p: jnp.sqrt(p["variance"] * (1 + 2 * p["tail"]) / 2) / (1 + p["tail"]),
+        ),
+        respread=_grown("variance", lambda p: jnp.sqrt(1 + 2 * p["tail"])),
     ),
     "Normal": Likelihood(
         dist.Normal, ("loc", "scale"), residuals.normal_residual, residuals.normal_shift, **_SCALED
@@ -129,7 +140,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.student_residual,
         residuals.student_shift,
         located=1,
-        relocate=lambda p, step: _to_loc("scale")(p, step * jnp.sqrt((p["df"] + 3) / (p["df"] + 1))),
+        relocate=_to_loc(lambda p: p["scale"] * jnp.sqrt((p["df"] + 3) / (p["df"] + 1))),
         respread=_grown("scale", lambda p: jnp.sqrt((p["df"] + 3) / (2 * p["df"]))),
     ),
     "Laplace": Likelihood(
@@ -138,7 +149,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.laplace_residual,
         residuals.laplace_shift,
         located=1,
-        relocate=_to_loc("scale"),
+        relocate=_to_loc(lambda p: p["scale"]),
         respread=_grown("scale"),
     ),
     "MultivariateNormal": Likelihood(
@@ -152,6 +163,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
             **p,
             "scale_tril": p["scale_tril"] * jnp.exp(step / _ROOT_TWO)[..., None, :],
         },
+        log_scale=0.5**0.5,
         trailing={"scale_tril": 1},
         log_prob=residuals.multivariate_normal_log_prob,
     ),
@@ -193,13 +205,16 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.bernoulli_residual,
         residuals.bernoulli_shift,
         relocate=_to_logits,
+        is_outcome=True,
     ),
-    "BernoulliProbs": Likelihood(dist.Bernoulli, ("probs",), residuals.probs_residual, residuals.probs_shift),
+    "BernoulliProbs": Likelihood(
+        dist.Bernoulli, ("probs",), residuals.probs_residual, residuals.probs_shift, is_outcome=True
+    ),
     "BinomialLogits": Likelihood(
         _binomial,
         ("total_count", "logits"),
-        residuals.binomial_residual,
-        residuals.binomial_shift,
+        residuals.bernoulli_residual,
+        residuals.bernoulli_shift,
         relocate=_to_logits,
     ),
     "BinomialProbs": Likelihood(

@@ -76,7 +76,10 @@ class Problem:
         self.live = live
         shapes, families = self._observed_shapes()
         self.located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
-        self.rows: Rows = make_rows(self.declaration, shapes, self.located, self.data, self._column)
+        joint = [n for n, f in families.items() if whiten.is_joint(f)]
+        self.rows: Rows = make_rows(
+            self.declaration, shapes, self.located, self.data, self._column, joint=joint
+        )
         self.layout: Layout = self._make_layout()
         self._runner = Runner(
             self.model,

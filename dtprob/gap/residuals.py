@@ -137,9 +137,9 @@ def gamma_shift(p: Parameters, t: Parameters) -> jax.Array:
 
 def weibull_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of a Weibull distribution."""
-    power = (value / p["scale"]) ** p["concentration"]
-    size = power - 1.0
-    shape = 1.0 - jnp.log(power) * size + (1 - EULER) * size
+    log_power = p["concentration"] * jnp.log(value / p["scale"])
+    size = jnp.expm1(log_power)
+    shape = 1.0 - log_power * size + (1 - EULER) * size
     return jnp.stack([size, shape * jnp.sqrt(6.0) / jnp.pi])
 
 
@@ -151,9 +151,13 @@ def weibull_shift(p: Parameters, t: Parameters) -> jax.Array:
 
 
 def multivariate_normal_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """The innovations of the entries in their order, their squares, and their products, each pair twice."""
+    """Rows of the innovations of the entries in their order, of their squares, and of their products with later ones.
+
+    Products are taken in a circle: with the next entry, with the one after it, to the opposite one, which has each pair
+    twice.
+    """
     r = _innovations(p, value)
-    products = [r * jnp.roll(r, -k, axis=-1) / _ROOT_TWO for k in range(1, r.shape[-1])]
+    products = [r * jnp.roll(r, -k, axis=-1) * weight for k, weight in _distances(r.shape[-1])]
     return jnp.stack([r, (r**2 - 1.0) / _ROOT_TWO, *products])
 
 
@@ -162,10 +166,16 @@ def multivariate_normal_shift(p: Parameters, t: Parameters) -> jax.Array:
     root = p["scale_tril"]
     location = solve_triangular(root, t["loc"][..., None], lower=True)[..., 0]
     relative = solve_triangular(root, t["scale_tril"], lower=True)
-    change = (relative + jnp.swapaxes(relative, -1, -2)) / _ROOT_TWO
+    change = relative + jnp.swapaxes(relative, -1, -2)
     size = root.shape[-1]
     at = jnp.arange(size)
-    return jnp.stack([location, *(change[..., at, (at + k) % size] for k in range(size))])
+    products = [change[..., at, (at + k) % size] * weight for k, weight in _distances(size)]
+    return jnp.stack([location, change[..., at, at] / _ROOT_TWO, *products])
+
+
+def _distances(size: int) -> list[tuple[int, float]]:
+    """Distances along a circle of entries, each with the weight of its products."""
+    return [(k, _ROOT_TWO**-1 if 2 * k == size else 1.0) for k in range(1, size // 2 + 1)]
 
 
 def _innovations(p: Parameters, value: jax.Array) -> jax.Array:
@@ -189,40 +199,37 @@ def poisson_shift(p: Parameters, t: Parameters) -> jax.Array:
 
 
 def bernoulli_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """Finite where the probability rounds to zero or one."""
-    return jnp.where(value > 0, jnp.exp(-p["logits"] / 2), -jnp.exp(p["logits"] / 2))[None]
+    """Rows of a Bernoulli or binomial distribution of logits; finite where the probability rounds to zero or one.
+
+    Nothing was tried where a binomial's count is zero, and nothing is said.
+    """
+    n, half = p.get("total_count", jnp.ones(())), p["logits"] / 2
+    yes = jnp.where(value > 0, value * jnp.exp(-half), 0.0)
+    no = jnp.where(value < n, (n - value) * jnp.exp(half), 0.0)
+    return ((yes - no) / jnp.sqrt(jnp.maximum(n, 1.0)))[None]
 
 
-def _logits_deviation(p: Parameters) -> jax.Array:
-    return jnp.sqrt(jax.nn.sigmoid(p["logits"]) * jax.nn.sigmoid(-p["logits"]))
+def logits_deviation(p: Parameters) -> jax.Array:
+    """Standard deviation of the number of successes."""
+    n = p.get("total_count", jnp.ones(()))
+    return jnp.sqrt(n * jax.nn.sigmoid(p["logits"]) * jax.nn.sigmoid(-p["logits"]))
 
 
 def bernoulli_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a Bernoulli of logits distribution."""
-    return (t["logits"] * _logits_deviation(p))[None]
+    """Shift of the rows of a Bernoulli or binomial distribution of logits."""
+    return (t["logits"] * logits_deviation(p))[None]
 
 
 def probs_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """Rows of a Bernoulli or binomial of probabilities distribution."""
-    n = p.get("total_count", 1.0)
-    return ((value - n * p["probs"]) / jnp.sqrt(n * p["probs"] * (1 - p["probs"])))[None]
+    """Rows of a Bernoulli or binomial distribution of probabilities."""
+    n = p.get("total_count", jnp.ones(()))
+    return ((value - n * p["probs"]) / jnp.sqrt(jnp.maximum(n, 1.0) * p["probs"] * (1 - p["probs"])))[None]
 
 
 def probs_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a Bernoulli or binomial of probabilities distribution."""
-    n = p.get("total_count", 1.0)
+    """Shift of the rows of a Bernoulli or binomial distribution of probabilities."""
+    n = p.get("total_count", jnp.ones(()))
     return (t["probs"] * jnp.sqrt(n / (p["probs"] * (1 - p["probs"]))))[None]
-
-
-def binomial_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """Rows of a binomial of logits distribution."""
-    n = p["total_count"]
-    return ((value - n * jax.nn.sigmoid(p["logits"])) / (jnp.sqrt(n) * _logits_deviation(p)))[None]
-
-
-def binomial_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a binomial of logits distribution."""
-    return (t["logits"] * jnp.sqrt(p["total_count"]) * _logits_deviation(p))[None]
 
 
 def _probability(p: Parameters) -> jax.Array:

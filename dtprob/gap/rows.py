@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -63,6 +63,8 @@ def make_rows(
     located: Mapping[str, int],
     data: Data,
     column: str | None,
+    *,
+    joint: Collection[str] = (),
 ) -> Rows:
     """Index the rows of every observed site.
 
@@ -72,6 +74,10 @@ def make_rows(
         located: how many components of each stand for its location.
         data: holds the cluster column, if one is named.
         column: a data entry whose values name the clusters; None for the declaration's axis.
+        joint: the sites whose entries along their last axis are one vector.
+
+    Raises:
+        InputError: a site has no axis of clusters, or a vector would be torn apart.
     """
     axes = sorted({axis for name in shapes for axis in declaration.sites[name].axes})
     coordinates: dict[str, list[np.ndarray]] = {axis: [] for axis in axes}
@@ -82,7 +88,15 @@ def make_rows(
         for axis in axes:
             index = grid[1 + site.axes.index(axis)] if axis in site.axes else np.full(shape, -1)
             coordinates[axis].append(index.reshape(-1))
-        ids.append(_cluster_of(declaration, site, grid[1:], labels, column).reshape(-1))
+        own = _cluster_of(declaration, site, grid[1:], labels, column)
+        if name in joint and (own != own[..., :1]).any():
+            raise InputError(
+                "cluster",
+                f"whole vectors of {name!r} in each",
+                f"{column or declaration.cluster or 'its own axis'!r}, which runs along a vector",
+                "Observe several vectors, in a plate, and name its axis",
+            )
+        ids.append(own.reshape(-1))
         marks.append((grid[0] < located[name]).reshape(-1))
     found = np.concatenate(ids)
     name = column or declaration.cluster or "row"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,9 @@ import numpyro.distributions as dist
 from dtprob.errors import InputError
 from dtprob.gap.likelihoods import LIKELIHOODS
 from dtprob.gap.residuals import Parameters
+
+_WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
+"""What changes the shape or the weight of a distribution and not its density."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +48,7 @@ def observation(fn: Any, value: Any, name: str) -> Observation:
         InputError: the diagnosis has no whitening for the distribution.
     """
     mask: Any = None
-    while hasattr(fn, "base_dist") and not isinstance(fn, dist.LogNormal):
+    while isinstance(fn, _WRAPPERS):
         if isinstance(fn, dist.MaskedDistribution):
             own = jnp.asarray(fn._mask)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
             own = own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
@@ -70,6 +73,13 @@ def observation(fn: Any, value: Any, name: str) -> Observation:
     if mask is not None:
         parameters["mask"] = jnp.broadcast_to(jnp.asarray(mask, float), shape)
     return Observation(family, parameters)
+
+
+def rewritten(observed: Observation, fn: Any, value: Any, name: str) -> Observation:
+    """Unwrap a distribution that was made from `distribution(observed)`, with the mask of the observation itself."""
+    new = observation(fn, value, name)
+    mask = {n: v for n, v in observed.parameters.items() if n == "mask"}
+    return Observation(new.family, {**new.parameters, **mask})
 
 
 def log_prob(observed: Observation, value: jax.Array) -> jax.Array:
@@ -105,6 +115,11 @@ def location_rows(family: str, n_rows: int) -> int:
     """How many of an observation's rows stand for its location or probability rather than its spread."""
     located = LIKELIHOODS[family].located
     return n_rows if located is None else located
+
+
+def is_joint(family: str) -> bool:
+    """Whether entries along the last axis are one vector, of which no entry stands alone."""
+    return LIKELIHOODS[family].log_prob is not None
 
 
 def moved(observed: Observation, step: jax.Array, *, spread: bool) -> Observation | None:

@@ -8,7 +8,9 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.effects.effect import Effect, Parameter
+from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
+from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
 
@@ -108,3 +110,15 @@ def test_a_wall_is_named_and_its_loss_is_right(kind):
 @pytest.mark.parametrize("kind", OBSERVED)
 def test_nothing_is_named_where_nothing_is_wrong(kind):
     assert found(kind, 0.0, seed=5).verdict == "NO_GAP"
+
+
+def test_a_vector_is_not_torn_into_clusters():
+    """Without a plate the entries of one vector would be taken as independent."""
+
+    def model(distance, y=None):
+        level = numpyro.deterministic("level", numpyro.sample("offset", dist.Normal(0.0, 5.0)) - distance)
+        numpyro.sample("y", dist.MultivariateNormal(level, scale_tril=ROOT), obs=y)
+
+    data = {"distance": jnp.linspace(0.0, 1.0, PLACES), "y": jnp.zeros(PLACES)}
+    with pytest.raises(InputError, match="whole vectors of 'y' in each"):
+        Problem(model, data, EFFECTS[1:])

@@ -66,13 +66,10 @@ FAMILIES = {
     ),
     "MultivariateNormal": (
         lambda loc, scale_tril: dist.MultivariateNormal(loc, scale_tril=scale_tril),
+        {"loc": strong([0.4, -1.0, 0.2, 0.1]), "scale_tril": strong(np.tri(4) * [0.7, 0.5, 0.9, 1.2])},
         {
-            "loc": strong([0.4, -1.0, 0.2]),
-            "scale_tril": strong([[0.7, 0, 0], [0.3, 0.5, 0], [-0.2, 0.4, 0.9]]),
-        },
-        {
-            "loc": strong([0.5, 0.3, -0.4]),
-            "scale_tril": strong([[0.2, 0, 0], [-0.3, 0.1, 0], [0.6, 0.2, -0.3]]),
+            "loc": strong([0.5, 0.3, -0.4, 0.2]),
+            "scale_tril": strong(np.tri(4) * [[0.2], [-0.3], [0.6], [0.1]]),
         },
     ),
     "Exponential": (dist.Exponential, {"rate": strong(2.3)}, {"rate": strong(0.6)}),
@@ -133,10 +130,11 @@ def expected_covariance(family, size):
     if family.startswith("Categorical"):  # one row per class; they sum to zero along sqrt(p)
         root = np.sqrt(np.asarray(PROBABILITY))
         return np.eye(size) - np.outer(root, root)
-    if family == "MultivariateNormal":  # the product of two entries is there twice, a half of it each time
-        pairs = [frozenset({i, (i + k) % 3}) for k in (1, 2) for i in range(3)]
-        products = np.array([[0.5 * (one == other) for other in pairs] for one in pairs])
-        return np.block([[np.eye(6), np.zeros((6, 6))], [np.zeros((6, 6)), products]])
+    if (
+        family == "MultivariateNormal"
+    ):  # products with the opposite entry are there twice, a half of them each time
+        twice = np.tile(np.eye(2), (2, 2)) / 2
+        return np.block([[np.eye(12), np.zeros((12, 4))], [np.zeros((4, 12)), twice]])
     return np.eye(size)
 
 
@@ -253,8 +251,16 @@ def test_samples_follow_the_observation():
 
 
 def test_unknown_distribution_is_refused_by_name():
-    with pytest.raises(InputError, match=r"observed site 'y'.*Beta"):
-        whiten.observation(dist.Beta(2.0, 1.0), jnp.ones(()), "y")
+    others = [
+        dist.Beta(2.0, 1.0),
+        dist.InverseGamma(2.0, 1.0),  # made of a gamma, an exponential, a normal
+        dist.Pareto(1.0, 2.0),
+        dist.LeftTruncatedDistribution(dist.Normal(), low=0.0),
+        dist.TransformedDistribution(dist.Normal(), dist.transforms.ExpTransform()),
+    ]
+    for other in others:
+        with pytest.raises(InputError, match=rf"observed site 'y'.*{type(other).__name__}"):
+            whiten.observation(other, jnp.full((), 0.5), "y")
 
 
 def test_entries_of_a_vector_have_its_density_together():
@@ -263,6 +269,26 @@ def test_entries_of_a_vector_have_its_density_together():
     entries = whiten.log_prob(batch("MultivariateNormal", values), values)
     assert entries.shape == values.shape
     np.testing.assert_allclose(entries.sum(-1), make(**parameters).log_prob(values), rtol=1e-10)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_scores_of_vectors_of_any_length(size):
+    rng = np.random.default_rng(size)
+    root = strong(np.tril(0.3 * rng.normal(size=(size, size)), -1) + np.diag(rng.uniform(0.5, 1.5, size)))
+    change = {
+        "loc": strong(rng.normal(size=size)),
+        "scale_tril": strong(np.tril(rng.normal(size=(size, size)))),
+    }
+    value = strong(rng.normal(size=(1, size)))
+    fn = dist.MultivariateNormal(jnp.zeros((1, size)), scale_tril=root)
+    observed = whiten.observation(fn, value, "y")
+    score = jnp.sum(whiten.residual(observed, value) * whiten.shift(observed, each(change, value)))
+
+    def density(t):
+        moved = dist.MultivariateNormal(t * change["loc"], scale_tril=root + t * change["scale_tril"])
+        return moved.log_prob(value[0])
+
+    np.testing.assert_allclose(score, jax.grad(density)(0.0), rtol=1e-8)
 
 
 def test_a_mask_of_whole_vectors():
@@ -277,13 +303,15 @@ MOVES = [
     (family, spread)
     for family, known in LIKELIHOODS.items()
     for spread in (False, True)
-    if (known.respread if spread else known.relocate) is not None and not family.endswith("Logits")
+    if (known.respread if spread else known.relocate) is not None
 ]
 
 
 @pytest.mark.parametrize(("family", "spread"), MOVES)
 def test_a_move_shifts_one_row_by_its_step(family, spread):
     observed = batch(family, draws(family, 1))
+    if family == "ComplexStudentT":
+        observed.parameters["tail"] = jnp.full(1, 0.3)
     like = jnp.zeros(observed.parameters[LIKELIHOODS[family].parameters[0]].shape, float)
     step = 0.3 + 0.2 * jnp.arange(like.size).reshape(like.shape)
 
@@ -296,6 +324,16 @@ def test_a_move_shifts_one_row_by_its_step(family, spread):
     wanted = np.zeros_like(rows)
     wanted[whiten.location_rows(family, len(rows)) if spread else 0] = step
     np.testing.assert_allclose(rows, wanted, atol=1e-6)
+
+
+def test_nothing_tried_says_nothing():
+    value = jnp.array([0, 0, 3])
+    for chance in ({"logits": jnp.array([0.3, 800.0, -800.0])}, {"probs": jnp.array([0.3, 0.9, 0.2])}):
+        observed = whiten.observation(dist.Binomial(jnp.array([0, 0, 5]), **chance), value, "y")
+        rows = np.asarray(whiten.residual(observed, value))
+        assert np.all(rows[:, :2] == 0)
+        assert np.all(np.isfinite(rows))
+        assert np.all(np.asarray(whiten.log_prob(observed, value))[:1] == 0)
 
 
 @pytest.mark.parametrize("logit", [-60.0, 60.0])
