@@ -322,11 +322,11 @@ def waiting(x, y=None):
     """Observations that the diagnosis cannot whiten."""
     with numpyro.plate("row", x.shape[0]):
         mean = numpyro.deterministic("mean", x)
-        numpyro.sample("y", dist.Gamma(jnp.exp(mean), 1.0), obs=y)
+        numpyro.sample("y", dist.InverseGamma(jnp.exp(mean), 1.0), obs=y)
 
 
 def test_an_unknown_distribution_is_refused():
-    with pytest.raises(InputError, match="Gamma"):
+    with pytest.raises(InputError, match="InverseGamma"):
         run(waiting, {"x": jnp.zeros(6), "y": jnp.ones(6)}, (bend(),))
 
 
