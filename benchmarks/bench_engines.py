@@ -32,10 +32,9 @@ from numpyro.infer.reparam import CircularReparam  # noqa: E402
 from record import record, recorded  # noqa: E402
 
 from dtprob.errors import InputError  # noqa: E402
-from dtprob.inference import NUTS, Posterior, RunOptions, resolve, summary  # noqa: E402
+from dtprob.inference import LATENTS_ONLY, NUTS, Posterior, resolve, summary  # noqa: E402
 from dtprob.models.complex_normal import ComplexNormal  # noqa: E402
 
-LEAN = RunOptions(pointwise=False, deterministics=False)
 CHAINS = {"warmup": 500, "draws": 500, "chains": 2}
 SETTINGS: dict[str, dict[str, Any]] = {
     "nuts": CHAINS,
@@ -138,9 +137,9 @@ def simulated(model: Callable[..., None], x: np.ndarray, seed: int) -> dict[str,
 def reference_of(model: Callable[..., None], data: dict[str, Any]) -> Posterior:
     """The closed form where there is one, else a long run."""
     try:
-        return resolve("exact", draws=20_000)(jax.random.key(9), model, data, options=LEAN)
+        return resolve("exact", draws=20_000)(jax.random.key(9), model, data, options=LATENTS_ONLY)
     except InputError:
-        return NUTS(warmup=1000, draws=2000, chains=2)(jax.random.key(9), model, data, options=LEAN)
+        return NUTS(warmup=1000, draws=2000, chains=2)(jax.random.key(9), model, data, options=LATENTS_ONLY)
 
 
 def measured(
@@ -150,10 +149,10 @@ def measured(
     engine = resolve(name, **SETTINGS[name])
     model = functools.partial(model)  # another object, for which nothing is compiled yet
     try:
-        cold, _ = timed(lambda: engine(jax.random.key(0), model, first, options=LEAN))
+        cold, _ = timed(lambda: engine(jax.random.key(0), model, first, options=LATENTS_ONLY))
     except InputError:
         return {}
-    warm, posterior = timed(lambda: engine(jax.random.key(1), model, second, options=LEAN))
+    warm, posterior = timed(lambda: engine(jax.random.key(1), model, second, options=LATENTS_ONLY))
     facts = {n: float(posterior.extra[n]) for n in ("log_evidence", "pareto_k") if n in posterior.extra}
     return {"engine": name, **seconds(cold, warm), **errors(posterior, reference), **facts}
 

@@ -31,13 +31,12 @@ import numpyro.distributions as dist  # noqa: E402
 from arviz_stats.base import array_stats  # noqa: E402
 from record import record, recorded  # noqa: E402
 
-from dtprob.inference import NUTS, BlackJAXNUTS, Posterior, RunOptions, fit, fit_each  # noqa: E402
+from dtprob.inference import LATENTS_ONLY, NUTS, BlackJAXNUTS, Posterior, fit, fit_each  # noqa: E402
 from dtprob.inference.build import build_target  # noqa: E402
 from dtprob.inference.chains import START, STEP  # noqa: E402
 from dtprob.inference.kernel import Place  # noqa: E402
 from dtprob.inference.target import Inputs, Target  # noqa: E402
 
-LEAN = RunOptions(pointwise=False, deterministics=False)
 STEPS: dict[str, Any] = {"warmup": 1000, "draws": 1000, "chains": 4}
 CHAINS: dict[str, Any] = {"warmup": 200, "draws": 200, "chains": 2}
 SHORT: dict[str, dict[str, Any]] = {
@@ -124,10 +123,12 @@ def loop(kind: type[NUTS] | type[BlackJAXNUTS], rounds: int) -> dict[str, Any]:
             paths = list(pool.map(lambda one: np.asarray(compiled(point, one, inputs)), keys))
         return np.stack(paths)[:, STEPS["warmup"] :]
 
-    ours = engine(key, regression, data, options=LEAN).draws["weight"]
+    ours = engine(key, regression, data, options=LATENTS_ONLY).draws["weight"]
     theirs = inputs.location + inputs.scale * plain()
     same = float(np.max(np.abs(ours - theirs)))
-    times = in_turns({"dtprob": lambda: engine(key, regression, data, options=LEAN), "direct": plain}, rounds)
+    times = in_turns(
+        {"dtprob": lambda: engine(key, regression, data, options=LATENTS_ONLY), "direct": plain}, rounds
+    )
     ratios = [a / b - 1 for a, b in zip(times["dtprob"], times["direct"], strict=True)]
     return {
         "what": f"loop of {engine.name}",
@@ -147,11 +148,11 @@ def sites(engine: str, options: argparse.Namespace) -> dict[str, Any]:
     keys = [jax.random.fold_in(key, i) for i in range(options.alone)]
 
     def together() -> Any:
-        return fit_each(place, {"x": x, "y": y}, ["y"], key=key, options=LEAN, **SHORT[engine])
+        return fit_each(place, {"x": x, "y": y}, ["y"], key=key, options=LATENTS_ONLY, **SHORT[engine])
 
     def alone() -> list[Any]:
         return [
-            fit(place, {"x": x, "y": y[i]}, key=keys[i], options=LEAN, **SHORT[ALONE[engine]])
+            fit(place, {"x": x, "y": y[i]}, key=keys[i], options=LATENTS_ONLY, **SHORT[ALONE[engine]])
             for i in range(options.alone)
         ]
 

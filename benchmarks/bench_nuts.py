@@ -35,9 +35,8 @@ from numpyro.infer import NUTS as RIVAL  # noqa: E402
 from record import record, recorded  # noqa: E402
 from sampler_problems import PROBLEMS, Problem  # noqa: E402
 
-from dtprob.inference import RunOptions, fit  # noqa: E402
+from dtprob.inference import LATENTS_ONLY, fit  # noqa: E402
 
-LEAN = RunOptions(pointwise=False, deterministics=False)
 STEPS: dict[str, Any] = {"warmup": 500, "draws": 500, "chains": 2}
 
 
@@ -129,7 +128,7 @@ def ours(problem: Problem, engine: str) -> Outcome:
     given, key = problem.ours[engine], jax.random.key(0)
     settings = given.settings or STEPS
     found, processor, wall = timed(
-        lambda: fit(given.model, given.data, engine=engine, key=key, options=LEAN, **settings)
+        lambda: fit(given.model, given.data, engine=engine, key=key, options=LATENTS_ONLY, **settings)
     )
     steps = float(np.mean(2.0 ** found.sample_stats["tree_depth"] - 1))
     return Outcome(given.quantities(found.draws), processor, wall, steps)

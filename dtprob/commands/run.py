@@ -15,7 +15,7 @@ from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.errors import InputError
 from dtprob.files import write_text
-from dtprob.inference import Posterior, RunOptions
+from dtprob.inference import LATENTS_ONLY, Posterior, RunOptions
 from dtprob.workflow import Prepared, prepare
 from dtprob.workflow.prepare import sha256
 
@@ -102,13 +102,12 @@ def infer(
         run.say(f"{file.name} is there already")
         return Posterior.load(file)
     checkpoint, status = file.with_suffix(".checkpoint"), file.with_suffix(".status.json")
-    options = RunOptions(
+    options = replace(
+        LATENTS_ONLY if latents_only else RunOptions(),
         progress=True,
         status_file=status,
         checkpoint=checkpoint,
         resume=run.resume and checkpoint.is_file(),
-        deterministics=not latents_only,
-        pointwise=not latents_only,
     )
     run.say(f"fitting with {prepared.engine.name}")
     posterior = prepared.engine(prepared.key, prepared.model, data, options=options)

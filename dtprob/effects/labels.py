@@ -232,9 +232,11 @@ def _soft(
     values = np.unique(column)
     quantiles = (np.arange(len(values)) + 0.5) / len(values)
     width = _SOFT / len(values)
-    half = 0.5 / len(values)
-    within = np.interp(column[inside], values, quantiles)
-    ends = {"from_quantile": (is_above, within.min() - half), "to_quantile": (is_below, within.max() + half)}
+    rank = np.searchsorted(values, column[inside])
+    ends = {
+        "from_quantile": (is_above, rank.min() / len(values)),
+        "to_quantile": (is_below, (rank.max() + 1) / len(values)),
+    }
     parameters = tuple(
         Parameter(name, dist.Normal(float(place), _EDGE), float(place), is_place=True)
         for name, (is_end, place) in ends.items()

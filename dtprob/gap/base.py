@@ -141,15 +141,19 @@ def _other_peaks(
     return [point for _, point in sorted(found, key=lambda f: -f[0])[:_MOST]]
 
 
+def local_maxima(values: np.ndarray) -> np.ndarray:
+    """Places of the local maxima (n,) of values along a line, its ends among them; what is not finite is none."""
+    padded = np.concatenate([[-np.inf], np.where(np.isfinite(values), values, -np.inf), [-np.inf]])
+    return np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
+
+
 def _peaks(values: np.ndarray, lines: np.ndarray) -> list[tuple[float, np.ndarray]]:
     """The highest inner peaks, away from the middle, of the best line over companions."""
     best = values.max(axis=0)
     if np.ptp(best[np.isfinite(best)]) < 1.0:
         return []
-    padded = np.concatenate([[-np.inf], best, [-np.inf]])
-    peaks = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
     middle = _GRID // 2
-    others = [int(k) for k in peaks if abs(int(k) - middle) > 1]
+    others = [int(k) for k in local_maxima(best) if abs(int(k) - middle) > 1]
     near = sorted(others, key=lambda k: abs(k - middle))[:_PEAKS]
     others = sorted({*near, *sorted(others, key=lambda k: -best[k])[:_PEAKS]})
     return [(float(best[k]), lines[int(values[:, k].argmax()), k]) for k in others]

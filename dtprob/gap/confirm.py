@@ -15,7 +15,7 @@ from dtprob.gap.diagnosis import Size
 from dtprob.gap.informed import informed
 from dtprob.gap.plausible import nulls, scales, sides
 from dtprob.gap.problem import Problem
-from dtprob.inference.engine import AbstractEngine, RunOptions
+from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.inference.laplace import Laplace
 
 _DIRECTIONS = ("x", "y", "z")
@@ -61,9 +61,8 @@ def _posterior(
         names = [e.site_name(p.name) for e in means for p in e.parameters]
         return {n: moved[:, [position[int(i)] for i in problem.layout[n].index[0]]] for n in names}
     started = _start_at(engine, problem.initial(fitted.x, means))
-    only_draws = RunOptions(deterministics=False, pointwise=False)
     model = with_effects(informed(problem.model, problem.known), means)
-    posterior = started(key, model, problem.data, options=only_draws)
+    posterior = started(key, model, problem.data, options=LATENTS_ONLY)
     return {name: np.asarray(draws) for name, draws in posterior.draws.items()}
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap import fit as fitting
-from dtprob.gap.base import polish
+from dtprob.gap.base import local_maxima, polish
 from dtprob.gap.plausible import nulls, places, scales, sides
 from dtprob.gap.problem import Problem
 from dtprob.gap.settings import Settings
@@ -145,9 +145,7 @@ def _along(
     for line in trials:
         v = values[low : low + len(line)]
         low += len(line)
-        padded = np.concatenate([[-np.inf], np.where(np.isfinite(v), v, -np.inf), [-np.inf]])
-        tops = np.flatnonzero((padded[1:-1] > padded[:-2]) & (padded[1:-1] >= padded[2:]))
-        peaks += [(float(v[k]), line[k]) for k in tops]
+        peaks += [(float(v[k]), line[k]) for k in local_maxima(v)]
     return float(values[0]), peaks
 
 

@@ -7,7 +7,7 @@ whose draws are laid out (chain, draw, *event). `fit` takes the engine's name in
 from dtprob.inference.auto import Auto, choose
 from dtprob.inference.blackjax_nuts import BlackJAXNUTS
 from dtprob.inference.each import fit_each
-from dtprob.inference.engine import AbstractEngine, RunOptions
+from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine, RunOptions
 from dtprob.inference.ensemble import Ensemble
 from dtprob.inference.exact import Exact
 from dtprob.inference.fit import ENGINES, fit, resolve
@@ -24,6 +24,7 @@ from dtprob.inference.von_mises_em import VonMisesEM
 __all__ = [
     "ENGINES",
     "HMC",
+    "LATENTS_ONLY",
     "NUTS",
     "SMC",
     "SVI",

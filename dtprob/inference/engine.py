@@ -55,6 +55,8 @@ class RunOptions:
 
 
 DEFAULT = RunOptions()
+LATENTS_ONLY = RunOptions(deterministics=False, pointwise=False)
+"""Keeps draws of what is unknown, and nothing that has an entry for each observation."""
 
 
 class AbstractEngine(abc.ABC):

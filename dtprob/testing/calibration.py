@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, Int, PRNGKeyArray
 from scipy import stats
 
-from dtprob.inference.engine import AbstractEngine, RunOptions
+from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.models.declaration import Model, trace_model
 
 DRAWS = 19
@@ -25,7 +25,6 @@ DRAWS = 19
 ENTRIES = 6
 """Entries of a site that are ranked, at most: evenly spaced ones."""
 _NULL = 20_000
-_LEAN = RunOptions(pointwise=False, deterministics=False)
 
 
 class Simulated(NamedTuple):
@@ -106,7 +105,7 @@ def simulated_ranks(
     for number in runs:
         truth_key, fit_key, turn_key = jax.random.split(jax.random.fold_in(key, number), 3)
         data, truth = case.simulate(truth_key)
-        posterior = engine(fit_key, case.model, data, options=_LEAN)
+        posterior = engine(fit_key, case.model, data, options=LATENTS_ONLY)
         turn = float(jax.random.uniform(turn_key, maxval=2 * np.pi))
         for name in posterior.latent:
             measure = _turned(turn) if name in posterior.circular else np.asarray

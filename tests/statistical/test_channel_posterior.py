@@ -7,12 +7,11 @@ import numpyro
 from arviz_stats.base import array_stats
 from scipy import stats
 
-from dtprob.inference import NUTS, BlackJAXNUTS, RunOptions
+from dtprob.inference import LATENTS_ONLY, NUTS, BlackJAXNUTS
 from dtprob.models.channel import ray_traced_channel
 from tests import small_world
 
 RATE = 1e-3
-LEAN = RunOptions(pointwise=False, deterministics=False)
 TRUTH = {
     "material_permittivity": jnp.asarray([4.6, 4.2]),
     "material_conductivity": jnp.asarray([0.08, 0.015]),
@@ -58,7 +57,7 @@ def test_two_samplers_agree_on_materials_and_noise():
     first, second = (
         entries(
             engine(draws=800, warmup=400, chains=4, initial=TRUTH)(
-                key, ray_traced_channel, data, options=LEAN
+                key, ray_traced_channel, data, options=LATENTS_ONLY
             )
         )
         for engine, key in ((NUTS, jax.random.key(3)), (BlackJAXNUTS, jax.random.key(4)))

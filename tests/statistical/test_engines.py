@@ -6,13 +6,12 @@ import pytest
 from arviz_stats.base import array_stats
 from scipy import stats
 
-from dtprob.inference import HMC, NUTS, SMC, SVI, BlackJAXNUTS, Ensemble, Exact, Laplace, RunOptions
+from dtprob.inference import HMC, LATENTS_ONLY, NUTS, SMC, SVI, BlackJAXNUTS, Ensemble, Exact, Laplace
 from dtprob.testing.calibration import DRAWS, judge, simulated_ranks
 from dtprob.testing.calibration_cases import CASES
 from tests.unit.inference.examples import logistic, logistic_data
 
 RATE = 1e-3
-LEAN = RunOptions(pointwise=False, deterministics=False)
 
 
 def standard_error(values):
@@ -27,7 +26,7 @@ def test_exact_engines_agree():
         BlackJAXNUTS(draws=1500, warmup=500, chains=4),
         SMC(draws=1500, chains=4, moves=3, leapfrog=6),
     )
-    first, *others = (engine(jax.random.key(7), logistic, data, options=LEAN) for engine in engines)
+    first, *others = (engine(jax.random.key(7), logistic, data, options=LATENTS_ONLY) for engine in engines)
     scores = []
     for second in others:
         for name in ("scale", "weight"):

@@ -9,8 +9,7 @@ import numpy as np
 from dtprob.effects import catalogue
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.trials import Say
-from dtprob.inference import Exact, Laplace
-from dtprob.inference.engine import RunOptions
+from dtprob.inference import LATENTS_ONLY, Exact, Laplace
 from dtprob.models.declaration import declare
 from dtprob.models.multi_access import multi_access, records
 from dtprob.workflow.loop.knowledge import log_of
@@ -39,8 +38,7 @@ def diagnosed(case: TwinCase, state: State, key: jax.Array, say: Say) -> dict[st
         _arguments(case, state, *rows) for rows in ((state.since, state.changed), (state.changed, None))
     )
     first, second = jax.random.split(key)
-    latents_only = RunOptions(deterministics=False, pointwise=False)
-    reference = Exact()(first, multi_access, before, options=latents_only)
+    reference = Exact()(first, multi_access, before, options=LATENTS_ONLY)
     sites = declare(multi_access, after).sites
     use = case.effects.use
     offered = catalogue(sites, after, use=use if isinstance(use, str) else list(use))

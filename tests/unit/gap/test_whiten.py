@@ -130,9 +130,7 @@ def expected_covariance(family, size):
     if family.startswith("Categorical"):  # one row per class; they sum to zero along sqrt(p)
         root = np.sqrt(np.asarray(PROBABILITY))
         return np.eye(size) - np.outer(root, root)
-    if (
-        family == "MultivariateNormal"
-    ):  # products with the opposite entry are there twice, a half of them each time
+    if family == "MultivariateNormal":  # each product with the opposite entry is there twice, by halves
         twice = np.tile(np.eye(2), (2, 2)) / 2
         return np.block([[np.eye(12), np.zeros((12, 4))], [np.zeros((4, 12)), twice]])
     return np.eye(size)
