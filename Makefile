@@ -22,7 +22,7 @@ lint: setup
 bench: setup
 	for file in benchmarks/bench_*.py; do $(BIN)/python $$file --write; done
 
-# Resolve the dependencies of pyproject.toml anew (needs uv).
-lock:
-	uv pip compile pyproject.toml --all-extras --group dev --universal --python-version 3.12 --generate-hashes \
+# Resolve the dependencies of pyproject.toml anew.
+lock: setup
+	$(BIN)/python -m uv pip compile pyproject.toml --all-extras --group dev --universal --python-version 3.12 --generate-hashes \
 	    --no-emit-index-url --custom-compile-command "make lock" --quiet --output-file requirements.lock

@@ -177,7 +177,7 @@ def test_a_second_look_at_the_sites_is_of_new_replicates(problem):
 
 def test_false_alarms_and_power_over_many_data_sets(problem):
     settings = Settings(replicates=60, site_replicates=60)
-    n, level, strong = 200, 0.1, 10
+    n, level, strong = 100, 0.1, 5
     by_effects, by_sites, first = np.zeros(n), np.zeros(n), []
     for i in range(n + strong):
         data = draw("line", seed=100 + i, shift=0.25 * inputs() ** 2 * (i >= n))
@@ -196,11 +196,11 @@ def test_false_alarms_and_power_over_many_data_sets(problem):
 
 @pytest.fixture(scope="module")
 def beside_a_field():
-    """Scores and site tests of 150 data sets with a random level of each link, at fits that know of it."""
+    """Scores and site tests of 100 data sets with a random level of each link, at fits that know of it."""
     problem = Problem(line, draw("line"), EFFECTS).with_live(["jitter"])
     settings = Settings(replicates=99, site_replicates=99)
     z, site = [], []
-    for seed in range(150):
+    for seed in range(100):
         level = 0.5 * SIGMA * np.random.default_rng(seed).normal(size=(12, 1))
         use(problem, draw("line", seed=1000 + seed, shift=level))
         fitted = fitting.fit(problem, problem.null(), ["jitter"], spread={"jitter": 0.5 * SIGMA})

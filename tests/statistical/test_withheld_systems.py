@@ -1,4 +1,4 @@
-"""12 withheld cases of networks and of ray-traced channels; see `tests.withheld_study` for what the bounds mean."""
+"""Three withheld cases of networks and one of a ray-traced channel; see `tests.withheld_study` for what the bounds mean."""
 
 import pytest
 
@@ -6,9 +6,9 @@ from tests.withheld_study import at_most, studied
 
 
 def test_networks(tmp_path):
-    found = studied(tmp_path, "network", ["null", "null", "listed", "null", "null"] * 2, seed=20)
+    found = studied(tmp_path, "network", ["null", "listed", "null"], seed=20)
     alarms, of = found["null"]["alarm"]
-    assert of == 8
+    assert of == 2
     assert alarms <= at_most(of, 0.01)
     missed, of = found["listed"]["missed"]
     assert missed <= at_most(of, 0.01)
@@ -16,7 +16,7 @@ def test_networks(tmp_path):
 
 @pytest.mark.libllvm
 def test_channels(tmp_path):
-    found = studied(tmp_path, "channel", ["null", "null"], seed=20)
+    found = studied(tmp_path, "channel", ["null"], seed=20)
     alarms, of = found["null"]["alarm"]
-    assert of == 2
+    assert of == 1
     assert alarms <= at_most(of, 0.01)

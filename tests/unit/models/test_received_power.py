@@ -61,7 +61,8 @@ def test_moments_are_those_of_random_phases():
 
 
 def test_level_and_spread_are_recovered(street):
-    data = {"paths": street, "power": jnp.asarray(drawn(street, gains_of(street), looks=1000, spread=0.3))}
+    power = jnp.asarray(drawn(street, gains_of(street), looks=1000, spread=0.3))
+    data = {"paths": street, "power": power, "materials": "known"}
     posterior = fit(received_power, data, engine="laplace", key=jax.random.key(0), draws=400)
     for name, truth in {"level_offset": np.log(1e-3), "measurement_spread": 0.3}.items():
         draws = np.asarray(posterior.draws[name]).reshape(-1)
@@ -81,10 +82,8 @@ def test_a_class_of_paths_that_is_weaker_is_named(street):
     gains = gains_of(street)
     direct = np.asarray(jnp.all(street.interaction == 0, axis=-1) & street.mask)
     assert direct.any(axis=1).sum() > 10
-    data = {
-        "paths": street,
-        "power": jnp.asarray(drawn(street, np.where(direct, 0.2 * gains, gains), looks=64)),
-    }
+    power = jnp.asarray(drawn(street, np.where(direct, 0.2 * gains, gains), looks=64))
+    data = {"paths": street, "power": power, "materials": "known"}
     names = ["missing_path", "rough_surface", "path_loss_exponent", "shadowing"]
     effects = catalogue(declare(received_power, data).sites, data, use=names)
     settings = Settings(replicates=200, site_replicates=39, candidates=3, max_effects=1)
