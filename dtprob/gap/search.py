@@ -38,6 +38,13 @@ class Step:
     trials: Trials
     accepted: str | None
 
+    @property
+    def end(self) -> Start:
+        """The fit with the effect that was accepted, or the one of the view."""
+        if self.accepted is None:
+            return Start(self.view.problem, self.view.fitted)
+        return Start(self.trials.problem, self.trials.fits[self.accepted])
+
 
 @dataclass(frozen=True)
 class Search:
@@ -153,17 +160,14 @@ def _forward(
             return steps
         keys = jax.random.fold_in(key, 1000 + len(steps))
         steps += _revised(steps[-1], base, keys, settings, say, banned=banned)
-        problem, fitted = steps[-1].trials.problem, _outcome(steps[-1])
+        reached = steps[-1].end
+        problem, fitted = reached.problem, reached.fitted
 
 
 def _looked(problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> View:
     beside = f" beside {', '.join(fitted.effects)}" if fitted.effects else ""
     say(f"screening {len(problem.effects)} effects{beside}")
     return view(problem, fitted, key, settings)
-
-
-def _outcome(step: Step) -> fitting.Fit:
-    return step.view.fitted if step.accepted is None else step.trials.fits[step.accepted]
 
 
 def _revised(
@@ -175,14 +179,15 @@ def _revised(
     """
     looked = {frozenset(last.view.fitted.effects)}
     for i in range(_REVISIONS):
-        problem, fitted = last.trials.problem, _outcome(last)
-        left_out = next((e for e in fitted.effects if frozenset(fitted.effects) - {e} not in looked), None)
+        reached = last.end
+        chosen = reached.fitted.effects
+        left_out = next((e for e in chosen if frozenset(chosen) - {e} not in looked), None)
         if left_out is None:
             return
-        rest = _refitted_without(problem, fitted, left_out)
+        rest = _refitted_without(reached.problem, reached.fitted, left_out)
         looked.add(frozenset(rest.effects))
-        seen = _looked(problem, rest, jax.random.fold_in(key, i), settings, say)
-        trials = tried(seen, settings, say, {left_out: Start(problem, fitted)}, banned=banned)
+        seen = _looked(reached.problem, rest, jax.random.fold_in(key, i), settings, say)
+        trials = tried(seen, settings, say, {left_out: reached}, banned=banned)
         last = Step(seen, trials, best(seen, base, trials.fits, settings))
         yield last
 

@@ -1,5 +1,7 @@
 """The search takes back a first choice that was made for two effects at once, and finds what no listed effect explains."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,6 +59,11 @@ def test_a_first_choice_made_for_two_effects_is_taken_back(seed):
     steps = look(rows(seed, shift=lambda x: 0.9 * np.sin(3 * x) + 0.6 * np.sin(5 * x)), seed)
     assert steps[0].accepted == "both"
     assert set(steps[-1].view.fitted.effects) == {"one", "two"}
+    for step in (
+        *steps,
+        replace(steps[0], accepted=None),
+    ):  # without an effect the trials' coordinates are not the fit's
+        assert step.end.fitted.x.shape == (step.end.problem.dimension,)
 
 
 def test_noise_that_differs_by_a_column_is_noticed():
