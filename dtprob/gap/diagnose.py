@@ -12,12 +12,12 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.errors import InputError
 from dtprob.gap import closed
-from dtprob.gap.base import fit_base
 from dtprob.gap.compose import compose
 from dtprob.gap.confirm import confirm
 from dtprob.gap.design_data import next_measurement
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
+from dtprob.gap.integrated import based
 from dtprob.gap.problem import Problem
 from dtprob.gap.remainder import model_remainder
 from dtprob.gap.search import search
@@ -87,7 +87,8 @@ def diagnose(
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
     keys = jax.random.split(key, 3)
     say(f"fitting the base model to {problem.n_cluster} clusters")
-    base = fit_base(problem, keys[0], polished=settings.polished)
+    start = based(problem, keys[0], polished=settings.polished, say=say)
+    problem, base = start.problem, start.fitted
     noted = notes(problem, base)
     for note in noted:
         say(f"note: {note}")

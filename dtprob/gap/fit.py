@@ -79,6 +79,11 @@ def _system(problem: Problem, active: Active, x: np.ndarray) -> System:
     _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
+    if problem.volume is not None:
+        shared, weights = problem.shared_index, np.asarray(active.weights)
+        place = np.array([int(np.flatnonzero(g_index == i)[0]) for i in shared])
+        prior_gradient[shared] += weights @ problem.volume.gradient(x[shared])
+        curvature[np.ix_(place, place)] -= np.tensordot(weights, problem.volume.bend, 1)
     cross = cross + np.moveaxis(hessian[:n][:, l_index], 0, 1)
     local = local + np.moveaxis(hessian[n:][:, l_index], 0, 1)
     for j in range(l_index.shape[1]):
@@ -93,16 +98,26 @@ def _system(problem: Problem, active: Active, x: np.ndarray) -> System:
     )
 
 
-def _objective(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
+def terms_of(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     """Log posterior as one global entry followed by one per cluster, without weights."""
     likelihood, prior, local = problem.compiled.evaluate(x)
     extra, _, _ = effect_prior(problem, active, x)
     return np.concatenate([[float(prior) + extra], likelihood + local])
 
 
-def _weighted(active: Active, terms: np.ndarray) -> float:
+def _value(problem: Problem, active: Active, x: np.ndarray) -> float:
+    """What a fit maximises."""
+    terms = terms_of(problem, active, x)
     value = terms[0] + float(active.weights @ np.where(active.weights > 0, terms[1:], 0.0))
+    value += _volume(problem, active, x)
     return value if np.isfinite(value) else -np.inf
+
+
+def _volume(problem: Problem, active: Active, x: np.ndarray) -> float:
+    """What integrating the clusters' own unknowns out adds, where a problem asks for it."""
+    return (
+        0.0 if problem.volume is None else float(active.weights @ problem.volume.at(x[problem.shared_index]))
+    )
 
 
 @np.errstate(over="ignore", invalid="ignore")  # bad starting points lead far out
@@ -129,7 +144,7 @@ def fit(
     """
     active = activate(problem, effects, weights, spread)
     x, damping, converged = np.array(x, float), 1e-3, False
-    value = _weighted(active, _objective(problem, active, x))
+    value = _value(problem, active, x)
     if value == -np.inf and not np.isfinite(problem.compiled.residual(x)).all():
         return _hopeless(active, x)
     latest: Changes = {}
@@ -145,7 +160,7 @@ def fit(
         change = 0.0
         if active.spread:
             active, change, latest = _respread(problem, active, x, system, latest)
-            value = _weighted(active, _objective(problem, active, x))
+            value = _value(problem, active, x)
         converged = converged and change < _SETTLED
         if converged or not (better or change >= _SETTLED):
             break
@@ -183,7 +198,7 @@ def _better(
     for _ in range(_TRIES):
         step = newton_step(system, damping, lowest)
         moved = _moved(active, x, step)
-        trial = _Trial(moved, _weighted(active, _objective(problem, active, moved)), step.gain, damping)
+        trial = _Trial(moved, _value(problem, active, moved), step.gain, damping)
         if trial.value > value:
             break
         damping = max(4 * damping, 1e-6)
@@ -245,7 +260,8 @@ def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, conve
     local = positive(system.local)
     schur = system.curvature
     n_local = local.shape[-1]
-    evidence = value + 0.5 * (len(active.global_index) + n_local * active.weights.sum()) * LOG_2PI
+    evidence = value - _volume(problem, active, x)  # told anew, not expanded
+    evidence += 0.5 * (len(active.global_index) + n_local * active.weights.sum()) * LOG_2PI
     if n_local:
         eliminated = np.linalg.solve(local, np.swapaxes(system.cross, 1, 2))
         schur = schur - np.einsum("c,cij,cjk->ik", active.weights, system.cross, eliminated)
@@ -297,28 +313,42 @@ def marginal(problem: Problem, fitted: Fit, *, steps: int = 20) -> np.ndarray:
     """
     active = activate(problem, fitted.effects, spread=fitted.spread)
     if not active.local_index.shape[1]:
-        return _objective(problem, active, fitted.x)[1:]
-    x = swept(problem, fitted.x, partial(_cluster_terms, problem, active)).copy()
+        return terms_of(problem, active, fitted.x)[1:]
+    x = swept(problem, fitted.x, partial(_cluster_terms, problem, active))
+    x, local = own_mode(problem, active, x, steps=steps)
     terms = _cluster_terms(problem, active, x)
-    damping = np.float64(1e-3)
+    return terms + 0.5 * local.shape[-1] * LOG_2PI - 0.5 * np.linalg.slogdet(local)[1]
+
+
+def own_mode(
+    problem: Problem, active: Active, x: np.ndarray, *, steps: int = 20, tolerance: float = 1e-3
+) -> tuple[np.ndarray, np.ndarray]:
+    """The point with each cluster's own coordinates at their mode given the shared ones, and their curvature there.
+
+    Args:
+        problem: the model and candidates on their data.
+        active: which coordinates are free.
+        x: where to start.
+        steps: at most so many Gauss-Newton steps.
+        tolerance: stop when the gain that a step promises, in nats per cluster, falls below.
+    """
+    x, terms, damping = x.copy(), _cluster_terms(problem, active, x), np.float64(1e-3)
     for _ in range(steps):
-        system = _system(problem, active, x)
-        step = local_step(system, float(damping))
+        step = local_step(_system(problem, active, x), float(damping))
         trial = _moved(active, x, step)
         new = _cluster_terms(problem, active, trial)
         better = new > terms
         x[active.local_index[better]] = trial[active.local_index[better]]
         terms = np.where(better, new, terms)
         damping = damping / 4 if better.all() else damping * 4
-        if step.gain < 1e-3 * problem.n_cluster:
+        if step.gain < tolerance * problem.n_cluster:
             break
-    local = positive(_system(problem, active, x).local)
-    return terms + 0.5 * local.shape[-1] * LOG_2PI - 0.5 * np.linalg.slogdet(local)[1]
+    return x, positive(_system(problem, active, x).local)
 
 
 def _cluster_terms(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     """Log likelihood and local prior of each cluster."""
-    terms = _objective(problem, active, x)[1:]
+    terms = terms_of(problem, active, x)[1:]
     for name, sd in active.spread.items():
         for block in problem.blocks_of(name):
             if block.local:

@@ -26,6 +26,7 @@ from dtprob.gap.programs import Programs
 from dtprob.gap.quick import quick_jit
 from dtprob.gap.rows import Rows, make_rows
 from dtprob.gap.running import Arrays, Runner, observations
+from dtprob.gap.volume import Volume
 from dtprob.inference.posterior import Sampler
 from dtprob.models.declaration import Data, Declaration, Model, declare, split_static, trace_model
 
@@ -65,6 +66,7 @@ class Problem:
         self._column = column
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self.per_cluster: frozenset[str] = frozenset()
+        self.volume: Volume | None = None
         self.set_live(())
         if reference is not None:
             self.known = normal_of(self._reference_draws(reference))
@@ -115,6 +117,12 @@ class Problem:
         for name in ("programs", "field_shapes"):
             other.__dict__.pop(name, None)
         other.set_live(other.effects)
+        return other
+
+    def with_volume(self, volume: Volume) -> Problem:
+        """The same problem, in which the clusters' own unknowns are integrated out as the volume says."""
+        other = copy(self)
+        other.volume = volume
         return other
 
     @cached_property
@@ -195,6 +203,12 @@ class Problem:
     def blocks_of(self, owner: str | None) -> list[Block]:
         """The blocks of a live effect by its name, or of the base model's nuisances."""
         return [block for block in self.layout.blocks if block.owner == owner]
+
+    @property
+    def shared_index(self) -> np.ndarray:
+        """Positions of the base model's coordinates that are not a cluster's own."""
+        parts = [block.index[0] for block in self.blocks_of(None) if not block.local]
+        return np.concatenate(parts) if parts else np.zeros(0, int)
 
     @cached_property
     def float_sites(self) -> dict[str, jax.ShapeDtypeStruct]:

@@ -175,6 +175,20 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     prior_slope, hessian = problem.compiled.prior(fitted.x, directions)
     _, effect_slope, effect_curvature = effect_prior(problem, active, fitted.x)
     w_global, w_local = np.ascontiguousarray(w[..., :n]), np.ascontiguousarray(w[..., n:])
+    slope = prior_slope + effect_slope
+    flat = np.zeros(problem.dimension)
+    flat[active.global_index] = np.diag(hessian[:n][:, active.global_index])
+    flat[active.local_index] = np.einsum("jcj->cj", hessian[n:][:, active.local_index])
+    flat = flat + effect_curvature
+    information = np.einsum("cmg,cmg->g", w_global, w_global), np.einsum("cml,cml->cl", w_local, w_local)
+    shared, own = (
+        _known(slope[index], flat[index], part)
+        for index, part in zip((active.global_index, active.local_index), information, strict=True)
+    )
+    if problem.volume is not None:  # what a coordinate does through the clusters' own is spread, not a shift
+        centre = fitted.x.copy()
+        centre[active.local_index] -= own.deviation
+        w_global = np.asarray(problem.compiled.linearised(centre, directions[:n])[1])
     transposed = np.swapaxes(w_local, 1, 2)
     local = transposed @ w_local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
     for j in range(active.local_index.shape[1]):
@@ -186,18 +200,6 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
         curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
     )
     inverse = np.linalg.inv(positive(curvature)) if n else curvature
-    slope = prior_slope + effect_slope
-    flat = np.zeros(problem.dimension)
-    flat[active.global_index] = np.diag(hessian[:n][:, active.global_index])
-    flat[active.local_index] = np.einsum("jcj->cj", hessian[n:][:, active.local_index])
-    flat = flat + effect_curvature
-    shared, own = (
-        _known(slope[index], flat[index], np.einsum(how, part, part))
-        for index, how, part in (
-            (active.global_index, "cmg,cmg->g", w_global),
-            (active.local_index, "cml,cml->cl", w_local),
-        )
-    )
     origin = fitted.x.copy()
     origin[active.global_index] -= shared.deviation
     origin[active.local_index] -= own.deviation

@@ -8,7 +8,7 @@ from typing import Any, Final
 
 import jax
 
-from dtprob.gap.base import fit_base
+from dtprob.gap.integrated import based
 from dtprob.gap.problem import Problem
 from dtprob.gap.rivals.claim import Claim
 from dtprob.gap.rivals.discrepancy import gaussian_process
@@ -39,7 +39,8 @@ def compete(problem: Problem, key: jax.Array, settings: Settings) -> dict[str, d
         settings: the same as those of the diagnosis with which they are compared.
     """
     keys, began = jax.random.split(key, 3), time.perf_counter()
-    seen = look(problem, fit_base(problem, keys[0]), keys[1], settings)
+    start = based(problem, keys[0])
+    seen = look(start.problem, start.fitted, keys[1], settings)
     common, answers = time.perf_counter() - began, {}
     for name, rival in RIVALS.items():
         began = time.perf_counter()
