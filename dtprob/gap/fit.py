@@ -257,6 +257,8 @@ def _respread(
 
 def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, converged: bool) -> Fit:
     system = _system(problem, active, x)
+    if not system.finite:
+        return _hopeless(active, x)
     local = positive(system.local)
     schur = system.curvature
     n_local = local.shape[-1]
@@ -266,6 +268,8 @@ def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, conve
         eliminated = np.linalg.solve(local, np.swapaxes(system.cross, 1, 2))
         schur = schur - np.einsum("c,cij,cjk->ik", active.weights, system.cross, eliminated)
         evidence -= 0.5 * float(active.weights @ np.linalg.slogdet(local)[1])
+    if not np.isfinite(schur).all():
+        return _hopeless(active, x)
     schur = positive(schur)
     evidence -= 0.5 * float(np.linalg.slogdet(schur)[1]) if len(schur) else 0.0
     covariance = np.linalg.inv(schur) if len(schur) else schur

@@ -1,7 +1,7 @@
 """Integrating out what each cluster has of its own, where a mode over all unknowns at once would be wrong.
 
-Such a mode is drawn to where the clusters' own unknowns have most room: a state for every reading lets the noise vanish, the
-spread of levels grows as these shrink. Integrated out by Laplace's method, the own unknowns of cluster c add
+Such a mode is drawn to where the clusters' own unknowns have most room: a state for every reading lets the noise vanish,
+the spread of levels grows as these shrink. Integrated out by Laplace's method, the own unknowns of cluster c add
 V_c = -1/2 log |H_c| to the log density, H_c their curvature. About the mode of that density V_c is expanded to second
 order, and every fit takes it along (Tierney and Kadane 1986; Rue, Martino and Chopin 2009, section 3).
 """
@@ -16,8 +16,9 @@ import numpy as np
 
 from dtprob.gap.active import activate
 from dtprob.gap.base import fit_base
-from dtprob.gap.fit import Fit, fit, own_mode, terms_of
+from dtprob.gap.fit import fit, own_mode, terms_of
 from dtprob.gap.problem import Problem
+from dtprob.gap.sweep import turned
 from dtprob.gap.trials import Say, Start
 from dtprob.gap.volume import Volume
 
@@ -33,6 +34,8 @@ _DENSE: Final = 12
 """Shared coordinates up to which second differences between two of them are taken too."""
 _MATTERS: Final = 4.0
 """Squared distance of a joint mode from the marginal one, in standard deviations, from which it is not taken."""
+_RUNAWAY: Final = 10.0
+"""Standard deviations of the prior beyond which a joint mode runs away."""
 _EXACT: Final = 1e-7
 _DRAWS: Final = 256
 
@@ -49,26 +52,22 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     Raises:
         InputError: the model has no finite likelihood from any start; what breaks is named.
     """
-    joint = fit_base(problem, key, polished=polished)
-    whole = _integrated(problem, joint)
-    if whole.volume is None:
-        return Start(problem, joint)
-    say("integrating out what each cluster has of its own")
-    return Start(whole, fit(whole, whole.volume.origin))
-
-
-def _integrated(problem: Problem, base: Fit) -> Problem:
-    """The problem, with a volume where the clusters' own unknowns draw the base fit too far."""
-    own, shared = activate(problem).local_index.shape[1], problem.shared_index
-    if not own or not len(shared):
-        return problem
+    shared = problem.shared_index
+    if not activate(problem).local_index.shape[1] or not len(shared):
+        return Start(problem, fit_base(problem, key, polished=polished))
     draws = problem.prior_draws(jax.random.key(0), _DRAWS)
-    scale = draws.std(axis=0)[shared]
-    if base.converged:
-        slope = _expanded(problem, base.x, scale).slope.sum(axis=0)
-        if slope @ base.covariance @ slope < _MATTERS:
-            return problem
-    return problem.with_volume(_about_the_mode(problem, np.median(draws, axis=0), scale))
+    centre, scale = np.median(draws, axis=0), draws.std(axis=0)[shared]
+    first = fit(problem, turned(problem, centre, problem.compiled.by_cluster))
+    away = np.abs(first.x - centre)[shared] / scale
+    if first.converged or (np.isfinite(first.log_posterior) and away.max() < _RUNAWAY):
+        joint = fit_base(problem, key, polished=polished)
+        slope = _expanded(problem, joint.x, scale).slope.sum(axis=0)
+        if slope @ joint.covariance @ slope < _MATTERS:
+            return Start(problem, joint)
+    say("integrating out what each cluster has of its own")
+    volume = _about_the_mode(problem, centre, scale)
+    whole = problem.with_volume(volume)
+    return Start(whole, fit(whole, volume.origin))
 
 
 def _about_the_mode(problem: Problem, start: np.ndarray, scale: np.ndarray) -> Volume:
