@@ -47,7 +47,8 @@ class Fit:
         x: the flat vector.
         effects: names of the effects that were free.
         spread: standard deviation of each free variance effect's field.
-        log_posterior: log likelihood plus log prior at the mode, over the clusters that the fit used.
+        log_posterior: log likelihood plus log prior at the mode, and the volume where there is one, over the clusters that
+            the fit used.
         log_evidence: its Laplace approximation of the log marginal likelihood.
         covariance: of the free global coordinates, in the order of `global_index`.
         global_index: their positions in the flat vector.
@@ -80,9 +81,10 @@ def _system(problem: Problem, active: Active, x: np.ndarray) -> System:
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
     if problem.volume is not None:
-        shared, weights = problem.shared_index, np.asarray(active.weights)
-        place = np.array([int(np.flatnonzero(g_index == i)[0]) for i in shared])
-        prior_gradient[shared] += weights @ problem.volume.gradient(x[shared])
+        base, weights = problem.shared_index, np.asarray(active.weights)
+        place = np.searchsorted(g_index, base, sorter=np.argsort(g_index))
+        place = np.argsort(g_index)[place]
+        prior_gradient[base] += weights @ problem.volume.gradient(x[base])
         curvature[np.ix_(place, place)] -= np.tensordot(weights, problem.volume.bend, 1)
     cross = cross + np.moveaxis(hessian[:n][:, l_index], 0, 1)
     local = local + np.moveaxis(hessian[n:][:, l_index], 0, 1)

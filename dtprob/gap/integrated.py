@@ -16,7 +16,7 @@ import numpy as np
 
 from dtprob.gap.active import activate
 from dtprob.gap.base import fit_base
-from dtprob.gap.fit import fit, own_mode, terms_of
+from dtprob.gap.fit import Fit, fit, own_mode, terms_of
 from dtprob.gap.problem import Problem
 from dtprob.gap.sweep import turned
 from dtprob.gap.trials import Say, Start
@@ -28,8 +28,8 @@ _ARRIVED: Final = 0.01
 """Nats by which a round has to be better."""
 _FAR: Final = 1.0
 """Standard deviations of the prior that a coordinate moves in a round at most."""
-_STEP: Final = 0.1
-"""Of the differences, in standard deviations of a coordinate's prior."""
+_STEPS: Final = (0.1, 0.5)
+"""Of the differences, in standard deviations of a coordinate's prior, and at most of its posterior."""
 _DENSE: Final = 12
 """Shared coordinates up to which second differences between two of them are taken too."""
 _MATTERS: Final = 4.0
@@ -38,6 +38,8 @@ _RUNAWAY: Final = 10.0
 """Standard deviations of the prior beyond which a joint mode runs away."""
 _EXACT: Final = 1e-7
 _DRAWS: Final = 256
+_MIDDLE: Final = 2.563
+"""Standard deviations between the first and the last tenth of a normal distribution."""
 
 
 def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lambda _: None) -> Start:
@@ -55,29 +57,44 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     shared = problem.shared_index
     if not activate(problem).local_index.shape[1] or not len(shared):
         return Start(problem, fit_base(problem, key, polished=polished))
-    draws = problem.prior_draws(jax.random.key(0), _DRAWS)
-    centre, scale = np.median(draws, axis=0), draws.std(axis=0)[shared]
-    first = fit(problem, turned(problem, centre, problem.compiled.by_cluster))
-    away = np.abs(first.x - centre)[shared] / scale
-    if first.converged or (np.isfinite(first.log_posterior) and away.max() < _RUNAWAY):
+    low, centre, high = np.quantile(problem.prior_draws(jax.random.key(0), _DRAWS), [0.1, 0.5, 0.9], axis=0)
+    scale = np.maximum((high - low)[shared] / _MIDDLE, 1e-12)
+    centre = turned(problem, centre, problem.compiled.by_cluster)
+    first, starts, step = fit(problem, centre), [centre], _STEPS[0] * scale
+    if not _runs_away(problem, first, centre, scale):
         joint = fit_base(problem, key, polished=polished)
-        slope = _expanded(problem, joint.x, scale).slope.sum(axis=0)
+        near = np.minimum(step, _STEPS[1] * np.sqrt(np.diag(joint.covariance)))
+        slope = _slopes(problem, joint.x, near).sum(axis=0)
         if slope @ joint.covariance @ slope < _MATTERS:
             return Start(problem, joint)
+        starts.append(joint.x)
     say("integrating out what each cluster has of its own")
-    volume = _about_the_mode(problem, centre, scale)
+    here, height = max((_height(problem, x) for x in starts), key=lambda found: found[1])
+    volume, height = _about_the_mode(problem, here, height, scale)
     whole = problem.with_volume(volume)
-    return Start(whole, fit(whole, volume.origin))
+    found = fit(whole, volume.origin)
+    if _height(problem, found.x)[1] < height - _ARRIVED:
+        found = fit(whole, volume.origin, steps=0)
+    return Start(whole, found)
 
 
-def _about_the_mode(problem: Problem, start: np.ndarray, scale: np.ndarray) -> Volume:
-    """The expansion about the mode of the marginal density."""
+def _runs_away(problem: Problem, first: Fit, centre: np.ndarray, scale: np.ndarray) -> bool:
+    """Whether a joint mode that was sought from a sound point lies where no prior expects it, or nowhere."""
+    if not np.isfinite(terms_of(problem, activate(problem), centre)).all():
+        return False
+    away = np.abs(first.x - centre)[problem.shared_index] / scale
+    lost = not np.isfinite(first.log_posterior)
+    return not first.converged and (lost or bool(away.max() > _RUNAWAY))
+
+
+def _about_the_mode(
+    problem: Problem, here: np.ndarray, height: float, scale: np.ndarray
+) -> tuple[Volume, float]:
+    """The expansion about the mode of the marginal density, and the log density there, from a point of a given one."""
     shared = problem.shared_index
-    here, height = _height(problem, start)
     for _ in range(_ROUNDS):
-        volume = _expanded(problem, here, scale)
-        there = fit(problem.with_volume(volume), here).x
-        move = there[shared] - here[shared]
+        volume = _expanded(problem, here, _STEPS[0] * scale)
+        move = (fit(problem.with_volume(volume), here).x - here)[shared]
         move *= min(1.0, _FAR / float(np.max(np.abs(move) / scale, initial=1e-300)))
         best, highest = here, height
         for share in _SHARES:
@@ -87,10 +104,10 @@ def _about_the_mode(problem: Problem, start: np.ndarray, scale: np.ndarray) -> V
             if value > height:
                 best, highest = trial, value
                 break
-        gain, here, height = highest - height, best, highest
-        if gain < _ARRIVED:
-            return volume
-    return _expanded(problem, here, scale)
+        if highest - height < _ARRIVED:
+            return volume, height
+        here, height = best, highest
+    return _expanded(problem, here, _STEPS[0] * scale), height
 
 
 def _height(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -101,29 +118,34 @@ def _height(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, float]:
     return x, total if np.isfinite(total) else -np.inf
 
 
-def _expanded(problem: Problem, x: np.ndarray, scale: np.ndarray) -> Volume:
-    """V_c about a point, by central differences."""
-    shared, n = problem.shared_index, len(problem.shared_index)
-    active = activate(problem)
+def _volume_at(problem: Problem, x: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """V_c (cluster,) where the shared coordinates are moved from a point, the clusters' own ones following."""
+    moved = x.copy()
+    moved[problem.shared_index] += move
+    local = own_mode(problem, activate(problem), moved, tolerance=_EXACT)[1]
+    return -0.5 * np.linalg.slogdet(local)[1]
 
-    def at(*moves: tuple[int, float]) -> np.ndarray:
-        moved = x.copy()
-        for i, sign in moves:
-            moved[shared[i]] += sign * _STEP * scale[i]
-        return -0.5 * np.linalg.slogdet(own_mode(problem, active, moved, tolerance=_EXACT)[1])[1]
 
-    middle = at()
-    up, down = ([at((i, sign)) for i in range(n)] for sign in (1.0, -1.0))
+def _slopes(problem: Problem, x: np.ndarray, step: np.ndarray) -> np.ndarray:
+    """Derivatives (cluster, shared) of V_c by central differences."""
+    units = np.diag(step)
+    up, down = ([_volume_at(problem, x, sign * u) for u in units] for sign in (1.0, -1.0))
+    return np.stack([(u - d) / 2 for u, d in zip(up, down, strict=True)], axis=1) / step
+
+
+def _expanded(problem: Problem, x: np.ndarray, step: np.ndarray) -> Volume:
+    """V_c about a point, by central differences; what curves upwards is taken as straight."""
+    n, units = len(step), np.diag(step)
+    middle = _volume_at(problem, x, np.zeros(n))
+    up, down = ([_volume_at(problem, x, sign * u) for u in units] for sign in (1.0, -1.0))
     slope = np.stack([(u - d) / 2 for u, d in zip(up, down, strict=True)], axis=1)
     bend = np.zeros((len(middle), n, n))
     for i in range(n):
         bend[:, i, i] = up[i] + down[i] - 2 * middle
     for i, j in combinations(range(n if n <= _DENSE else 0), 2):
-        bend[:, i, j] = bend[:, j, i] = at((i, 1.0), (j, 1.0)) - up[i] - up[j] + middle
-    step = _STEP * scale
-    return Volume(x, x[shared], middle, slope / step, _downwards(bend) / np.outer(step, step))
-
-
-def _downwards(bend: np.ndarray) -> np.ndarray:
-    values, vectors = np.linalg.eigh(np.nan_to_num(bend, posinf=0.0, neginf=0.0))
-    return np.einsum("cij,cj,ckj->cik", vectors, np.minimum(values, 0.0), vectors)
+        both = sum(_volume_at(problem, x, sign * (units[i] + units[j])) for sign in (1.0, -1.0))
+        bend[:, i, j] = bend[:, j, i] = both / 2 - middle - (bend[:, i, i] + bend[:, j, j]) / 2
+    value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
+    values, vectors = np.linalg.eigh(bend)
+    bend = np.einsum("cij,cj,ckj->cik", vectors, np.minimum(values, 0.0), vectors)
+    return Volume(x, x[problem.shared_index], value, slope / step, bend / np.outer(step, step))

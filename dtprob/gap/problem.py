@@ -119,7 +119,7 @@ class Problem:
         other.set_live(other.effects)
         return other
 
-    def with_volume(self, volume: Volume) -> Problem:
+    def with_volume(self, volume: Volume | None) -> Problem:
         """The same problem, in which the clusters' own unknowns are integrated out as the volume says."""
         other = copy(self)
         other.volume = volume

@@ -101,7 +101,7 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
             f"{problem.n_cluster} clusters for {len(owners)} fitted parameters: what is held out tells little of how far"
             " a cause closes the gap"
         )
-    projection = project(problem, fitted)
+    projection = project(problem.with_volume(None), fitted)  # what acts through the clusters' own is seen too
     columns, reduced = projection.columns, projection.reduced
     total = np.einsum("cmi,cmi->i", columns, columns)
     seen = total > 0

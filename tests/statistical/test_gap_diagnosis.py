@@ -15,6 +15,7 @@ import pytest
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap import diagnose as diagnosing
+from dtprob.gap import integrated
 from dtprob.gap.confirm import confirm
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fit import fit
@@ -267,7 +268,7 @@ def test_a_base_fit_in_a_wrong_basin_is_taken_back(monkeypatch):
     rng = np.random.default_rng(0)
     x = rng.uniform(0.0, 2.0, (12, 20))
     data = {"x": x, "y": np.cos(2 * np.pi * 2.0 * x) + SIGMA * rng.normal(size=x.shape)}
-    monkeypatch.setattr(diagnosing, "fit_base", lambda problem, *_, **__: fit(problem, np.array([0.9])))
+    monkeypatch.setattr(integrated, "fit_base", lambda problem, *_, **__: fit(problem, np.array([0.9])))
     lines = []
     found = run(wave, data, (bend(), ripple()), say=lines.append)
     assert any("starting again" in line for line in lines)

@@ -9,6 +9,7 @@ import pytest
 from scipy import optimize, stats
 
 from dtprob.effects import Effect, Parameter
+from dtprob.errors import InputError
 from dtprob.gap.base import fit_base
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.integrated import based
@@ -20,10 +21,10 @@ KEY = jax.random.key(0)
 SETTINGS = Settings(replicates=100, site_replicates=39, candidates=2)
 
 
-def levels(place, level=None):
-    """Readings about levels of their own, whose spread is unknown."""
+def levels(place, known=None, level=None):
+    """Readings about levels of their own, whose spread is unknown unless it is given."""
     mean = numpyro.sample("mean", dist.Normal(0.0, 10.0))
-    spread = numpyro.sample("spread", dist.LogNormal(0.0, 1.0))
+    spread = numpyro.sample("spread", dist.LogNormal(0.0, 1.0)) if known is None else known
     noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
     with numpyro.plate("link", place.shape[0], dim=-2):
         own = numpyro.sample("own", dist.Normal(0.0, 1.0))
@@ -105,8 +106,8 @@ def test_the_mode_is_that_of_the_exact_marginal_density():
 
 def test_levels_of_known_spread_are_left_to_the_joint_mode():
     data = of_levels(links=40, readings=12)
-    known = numpyro.handlers.substitute(levels, data={"spread": 1.5})
-    assert based(Problem(known, data, [added("slope", lambda c: c["place"])]), KEY).problem.volume is None
+    problem = Problem(levels, {**data, "known": 1.5}, [added("slope", lambda c: c["place"])])
+    assert based(problem, KEY).problem.volume is None
 
 
 def test_a_volume_is_what_its_derivatives_say():
@@ -118,17 +119,38 @@ def test_a_volume_is_what_its_derivatives_say():
         slope = (volume.at(away + h * unit) - volume.at(away - h * unit)) / (2 * h)
         np.testing.assert_allclose(volume.gradient(away)[:, i], slope, rtol=1e-6, atol=1e-8)
     spread, noise = np.exp(volume.centre[1:])
-    np.testing.assert_allclose(volume.value, -0.5 * np.log(1 + 3 * spread**2 / noise**2), rtol=1e-5)
+    ratio = 3 * spread**2 / noise**2
+    share = ratio / (1 + ratio)
+    np.testing.assert_allclose(volume.value, -0.5 * np.log(1 + ratio), rtol=1e-5)
+    np.testing.assert_allclose(volume.slope, np.tile([0.0, -share, share], (20, 1)), atol=1e-3)
+    bend = -2 * share * (1 - share) * np.array([[0, 0, 0], [0, 1, -1], [0, -1, 1]])
+    np.testing.assert_allclose(volume.bend, np.tile(bend, (20, 1, 1)), atol=0.02)
 
 
 @pytest.mark.parametrize("drop", [0.0, 2.0])
 def test_a_state_for_every_reading_is_no_gap(drop):
     """The joint mode lets the noise vanish, and all that is random would look like a gap."""
+    told = []
     found = diagnose(
-        fading, of_fading(1, drop), [DROP, WARM], key=KEY, engine=Laplace(draws=100), settings=SETTINGS
+        fading,
+        of_fading(1, drop),
+        [DROP, WARM],
+        key=KEY,
+        engine=Laplace(draws=100),
+        settings=SETTINGS,
+        say=told.append,
     )
+    assert any(line.startswith("integrating out") for line in told)
+    assert not any(line.startswith("note") for line in told)
     if drop:
         assert [c.effects for c in found.causes] == [("drop",)]
         assert abs(found.causes[0].size[0].mean - drop) < 1.0
     else:
         assert found.verdict == "NO_GAP"
+
+
+def test_a_broken_model_with_states_says_what_breaks():
+    data = of_levels()
+    data["level"] = data["level"].at[3, 1].set(jnp.nan)
+    with pytest.raises(InputError, match=r"data level: expected finite values"):
+        based(Problem(levels, data, [added("slope", lambda c: c["place"])]), KEY)
