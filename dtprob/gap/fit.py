@@ -81,9 +81,8 @@ def _system(problem: Problem, active: Active, x: np.ndarray) -> System:
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
     if problem.volume is not None:
-        base, weights = problem.shared_index, np.asarray(active.weights)
-        place = np.searchsorted(g_index, base, sorter=np.argsort(g_index))
-        place = np.argsort(g_index)[place]
+        base, weights = active.base_index, np.asarray(active.weights)
+        place = np.isin(g_index, base)
         prior_gradient[base] += weights @ problem.volume.gradient(x[base])
         curvature[np.ix_(place, place)] -= np.tensordot(weights, problem.volume.bend, 1)
     cross = cross + np.moveaxis(hessian[:n][:, l_index], 0, 1)
@@ -117,9 +116,7 @@ def _value(problem: Problem, active: Active, x: np.ndarray) -> float:
 
 def _volume(problem: Problem, active: Active, x: np.ndarray) -> float:
     """What integrating the clusters' own unknowns out adds, where a problem asks for it."""
-    return (
-        0.0 if problem.volume is None else float(active.weights @ problem.volume.at(x[problem.shared_index]))
-    )
+    return 0.0 if problem.volume is None else float(active.weights @ problem.volume.at(x[active.base_index]))
 
 
 @np.errstate(over="ignore", invalid="ignore")  # bad starting points lead far out

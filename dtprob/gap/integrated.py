@@ -37,9 +37,6 @@ _MATTERS: Final = 4.0
 _RUNAWAY: Final = 10.0
 """Standard deviations of the prior beyond which a joint mode runs away."""
 _EXACT: Final = 1e-7
-_DRAWS: Final = 256
-_MIDDLE: Final = 2.563
-"""Standard deviations between the first and the last tenth of a normal distribution."""
 
 
 def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lambda _: None) -> Start:
@@ -54,27 +51,28 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     Raises:
         InputError: the model has no finite likelihood from any start; what breaks is named.
     """
-    shared = problem.shared_index
-    if not activate(problem).local_index.shape[1] or not len(shared):
+    active = activate(problem)
+    if not active.local_index.shape[1] or not len(active.global_index):
         return Start(problem, fit_base(problem, key, polished=polished))
-    low, centre, high = np.quantile(problem.prior_draws(jax.random.key(0), _DRAWS), [0.1, 0.5, 0.9], axis=0)
-    scale = np.maximum((high - low)[shared] / _MIDDLE, 1e-12)
+    centre, deviation = problem.prior_middle
+    scale = np.maximum(deviation[active.global_index], 1e-12)
     centre = turned(problem, centre, problem.compiled.by_cluster)
     first, starts, step = fit(problem, centre), [centre], _STEPS[0] * scale
     if not _runs_away(problem, first, centre, scale):
         joint = fit_base(problem, key, polished=polished)
         near = np.minimum(step, _STEPS[1] * np.sqrt(np.diag(joint.covariance)))
-        slope = _slopes(problem, joint.x, near).sum(axis=0)
+        up, down = _beside(problem, joint.x, near)
+        slope = (up - down).sum(axis=0) / (2 * near)
         if slope @ joint.covariance @ slope < _MATTERS:
             return Start(problem, joint)
         starts.append(joint.x)
     say("integrating out what each cluster has of its own")
     here, height = max((_height(problem, x) for x in starts), key=lambda found: found[1])
-    volume, height = _about_the_mode(problem, here, height, scale)
+    here, height, volume = _about_the_mode(problem, here, height, scale)
     whole = problem.with_volume(volume)
-    found = fit(whole, volume.origin)
+    found = fit(whole, here)
     if _height(problem, found.x)[1] < height - _ARRIVED:
-        found = fit(whole, volume.origin, steps=0)
+        found = fit(whole, here, steps=0)
     return Start(whole, found)
 
 
@@ -82,16 +80,16 @@ def _runs_away(problem: Problem, first: Fit, centre: np.ndarray, scale: np.ndarr
     """Whether a joint mode that was sought from a sound point lies where no prior expects it, or nowhere."""
     if not np.isfinite(terms_of(problem, activate(problem), centre)).all():
         return False
-    away = np.abs(first.x - centre)[problem.shared_index] / scale
+    away = np.abs(first.x - centre)[first.global_index] / scale
     lost = not np.isfinite(first.log_posterior)
     return not first.converged and (lost or bool(away.max() > _RUNAWAY))
 
 
 def _about_the_mode(
     problem: Problem, here: np.ndarray, height: float, scale: np.ndarray
-) -> tuple[Volume, float]:
-    """The expansion about the mode of the marginal density, and the log density there, from a point of a given one."""
-    shared = problem.shared_index
+) -> tuple[np.ndarray, float, Volume]:
+    """The mode of the marginal density, the log density and the expansion there, from a point and the density there."""
+    shared = activate(problem).global_index
     for _ in range(_ROUNDS):
         volume = _expanded(problem, here, _STEPS[0] * scale)
         move = (fit(problem.with_volume(volume), here).x - here)[shared]
@@ -105,9 +103,9 @@ def _about_the_mode(
                 best, highest = trial, value
                 break
         if highest - height < _ARRIVED:
-            return volume, height
+            return here, height, volume
         here, height = best, highest
-    return _expanded(problem, here, _STEPS[0] * scale), height
+    return here, height, _expanded(problem, here, _STEPS[0] * scale)
 
 
 def _height(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, float]:
@@ -120,32 +118,32 @@ def _height(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, float]:
 
 def _volume_at(problem: Problem, x: np.ndarray, move: np.ndarray) -> np.ndarray:
     """V_c (cluster,) where the shared coordinates are moved from a point, the clusters' own ones following."""
-    moved = x.copy()
-    moved[problem.shared_index] += move
-    local = own_mode(problem, activate(problem), moved, tolerance=_EXACT)[1]
+    active, moved = activate(problem), x.copy()
+    moved[active.global_index] += move
+    local = own_mode(problem, active, moved, tolerance=_EXACT)[1]
     return -0.5 * np.linalg.slogdet(local)[1]
 
 
-def _slopes(problem: Problem, x: np.ndarray, step: np.ndarray) -> np.ndarray:
-    """Derivatives (cluster, shared) of V_c by central differences."""
-    units = np.diag(step)
-    up, down = ([_volume_at(problem, x, sign * u) for u in units] for sign in (1.0, -1.0))
-    return np.stack([(u - d) / 2 for u, d in zip(up, down, strict=True)], axis=1) / step
+def _beside(problem: Problem, x: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """V_c (cluster, shared) a step up and a step down each shared coordinate."""
+    up, down = (
+        np.stack([_volume_at(problem, x, sign * unit) for unit in np.diag(step)], axis=1)
+        for sign in (1.0, -1.0)
+    )
+    return up, down
 
 
 def _expanded(problem: Problem, x: np.ndarray, step: np.ndarray) -> Volume:
     """V_c about a point, by central differences; what curves upwards is taken as straight."""
     n, units = len(step), np.diag(step)
     middle = _volume_at(problem, x, np.zeros(n))
-    up, down = ([_volume_at(problem, x, sign * u) for u in units] for sign in (1.0, -1.0))
-    slope = np.stack([(u - d) / 2 for u, d in zip(up, down, strict=True)], axis=1)
-    bend = np.zeros((len(middle), n, n))
-    for i in range(n):
-        bend[:, i, i] = up[i] + down[i] - 2 * middle
+    up, down = _beside(problem, x, step)
+    slope = (up - down) / 2
+    bend = (up + down - 2 * middle[:, None])[:, :, None] * np.eye(n)
     for i, j in combinations(range(n if n <= _DENSE else 0), 2):
         both = sum(_volume_at(problem, x, sign * (units[i] + units[j])) for sign in (1.0, -1.0))
         bend[:, i, j] = bend[:, j, i] = both / 2 - middle - (bend[:, i, i] + bend[:, j, j]) / 2
     value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
     values, vectors = np.linalg.eigh(bend)
     bend = np.einsum("cij,cj,ckj->cik", vectors, np.minimum(values, 0.0), vectors)
-    return Volume(x, x[problem.shared_index], value, slope / step, bend / np.outer(step, step))
+    return Volume(x[activate(problem).global_index], value, slope / step, bend / np.outer(step, step))

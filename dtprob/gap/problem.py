@@ -204,12 +204,6 @@ class Problem:
         """The blocks of a live effect by its name, or of the base model's nuisances."""
         return [block for block in self.layout.blocks if block.owner == owner]
 
-    @property
-    def shared_index(self) -> np.ndarray:
-        """Positions of the base model's coordinates that are not a cluster's own."""
-        parts = [block.index[0] for block in self.blocks_of(None) if not block.local]
-        return np.concatenate(parts) if parts else np.zeros(0, int)
-
     @cached_property
     def float_sites(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Deterministic sites on which a perturbation makes sense, in the largest shape that a candidate gives them."""
@@ -346,15 +340,18 @@ class Problem:
         return draw
 
     @cached_property
-    def usual(self) -> dict[str, tuple[float, float]]:
-        """Centre and standard deviation, by the middle eight tenths of the prior, of the base model's latent sites."""
+    def prior_middle(self) -> tuple[np.ndarray, np.ndarray]:
+        """Median and standard deviation, by the middle eight tenths of the prior, of each coordinate (dimension,)."""
         draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
         low, middle, high = np.quantile(draws, [0.1, 0.5, 0.9], axis=0)
+        return middle, (high - low) / _MIDDLE
+
+    @cached_property
+    def usual(self) -> dict[str, tuple[float, float]]:
+        """Centre and standard deviation, by the middle eight tenths of the prior, of the base model's latent sites."""
+        middle, deviation = self.prior_middle
         blocks = [(b.name, b.index) for b in self.blocks_of(None) if b.size]
-        return {
-            name: (float(np.median(middle[i])), float(np.median(high[i] - low[i])) / _MIDDLE)
-            for name, i in blocks
-        }
+        return {name: (float(np.median(middle[i])), float(np.median(deviation[i]))) for name, i in blocks}
 
     def initial(self, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, jax.Array]:
         """Constrained values at x of the latent sites and of the given live mean effects' parameters, by site name."""

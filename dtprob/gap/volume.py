@@ -13,14 +13,12 @@ class Volume:
     """Expansion of V_c = -1/2 log |H_c| in the base model's shared coordinates, H_c the curvature of a cluster's own ones.
 
     Attributes:
-        origin: flat vector of the base model about which it is expanded.
-        centre: its shared coordinates.
+        centre: the shared coordinates about which it is expanded.
         value: V_c there.
         slope: first derivatives.
         bend: second derivatives, none of them upwards.
     """
 
-    origin: Float[np.ndarray, " dimension"]
     centre: Float[np.ndarray, " shared"]
     value: Float[np.ndarray, " cluster"]
     slope: Float[np.ndarray, "cluster shared"]
