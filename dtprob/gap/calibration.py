@@ -1,7 +1,8 @@
 """Whether predictions of clusters that a fit has not seen are as uncertain as they should be.
 
 To first order in what is not known: parameters have their posterior from the other clusters, random weights that each
-cluster has of its own have their prior. What the base model refits in every cluster anyway (phases, levels) is refitted.
+cluster has of its own have their prior, and so has what the base fit integrates out (states). What the base model refits in
+every cluster anyway (phases, levels) is refitted.
 """
 
 from __future__ import annotations
@@ -14,12 +15,13 @@ import jax.numpy as jnp
 import numpy as np
 from scipy import stats
 
-from dtprob.gap.active import activate, basis
+from dtprob.gap.active import Active, activate, basis
 from dtprob.gap.closed import Fold
 from dtprob.gap.fit import Fit
 from dtprob.gap.likelihoods import LIKELIHOODS
 from dtprob.gap.newton import positive
 from dtprob.gap.problem import Problem
+from dtprob.gap.projection import project
 
 _WIDEST: Final = 2.0
 """Log spread beyond which the noise's own spread is not followed."""
@@ -30,7 +32,7 @@ _ABSORBED: Final = 0.05
 
 @dataclass(frozen=True)
 class Calibration:
-    """Predicted against actual errors, on clusters that were left out.
+    """Predicted against actual errors, on clusters that were left out; None where they refit all that they show.
 
     Attributes:
         coverage: share of observed entries inside their 90% predictive interval; None where not all are normal.
@@ -62,8 +64,11 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
         squares.append(scaled**2 * np.exp(-2 * swing**2))
         families |= {o.family for o in problem.compiled.observations(part.x).values()}
     known = [LIKELIHOODS[family] for family in families]
-    coverage = None if any(f.log_scale is None for f in known) else float(np.concatenate(inside).mean())
-    ratio = None if any(f.is_outcome for f in known) else float(np.sqrt(np.concatenate(squares).mean()))
+    each, squared = np.concatenate(inside), np.concatenate(squares)
+    if not each.size:
+        return Calibration(None, None)
+    coverage = None if any(f.log_scale is None for f in known) else float(each.mean())
+    ratio = None if any(f.is_outcome for f in known) else float(np.sqrt(squared.mean()))
     return Calibration(coverage, ratio)
 
 
@@ -78,27 +83,19 @@ class _Predicted(NamedTuple):
 def _predicted(problem: Problem, part: Fit, held: np.ndarray) -> _Predicted:
     """Errors of held-out clusters, whose own random weights are at zero, and how large they should be."""
     active = activate(problem, part.effects, spread=part.spread)
-    blocks = [b for b in active.blocks if b.local]
-    x, is_field = part.x.copy(), np.zeros(0, bool)
-    sd = np.zeros(0)
-    for block in blocks:
-        own = block.owner is not None
-        is_field = np.append(is_field, np.full(block.size, own))
-        sd = np.append(sd, np.full(block.size, part.spread[block.owner] if block.owner is not None else 0.0))
-        if own:
-            x[block.index[held]] = 0.0
+    x, sd, drawn = _own(problem, part, active)
     directions = basis(problem, active)
     e, w = (np.asarray(v)[held] for v in problem.compiled.linearised(x, directions))
     slope, hessian = problem.compiled.prior(x, directions)
     n, index = len(active.global_index), active.local_index[held]
-    local, field = w[..., n:][..., ~is_field], w[..., n:][..., is_field] * sd[is_field]
-    places = index[:, ~is_field]
+    local, random = w[..., n:][..., ~drawn], w[..., n:][..., drawn] * sd[held][:, None, drawn]
+    places = index[:, ~drawn]
     curvature = np.einsum("cmi,cmj->cij", local, local)
-    curvature = curvature + np.moveaxis(hessian[n:][~is_field][:, places], 0, 1)
+    curvature = curvature + np.moveaxis(hessian[n:][~drawn][:, places], 0, 1)
     inverse = np.linalg.inv(positive(curvature)) if local.shape[-1] else curvature
     pull = np.einsum("cmi,cij->cmj", local, inverse)
     score = np.einsum("cmi,cm->ci", local, e) + slope[places]
-    unknown = np.concatenate([w[..., :n] @ _root(part.covariance), field], axis=-1)
+    unknown = np.concatenate([w[..., :n] @ _root(part.covariance), random], axis=-1)
     left = unknown - np.einsum("cmi,cki,ckj->cmj", pull, local, unknown)
     noise = 1 - 2 * np.einsum("cmi,cmi->cm", pull, local)
     noise = noise + np.einsum("cmi,cij,cmj->cm", pull, np.einsum("cki,ckj->cij", local, local), pull)
@@ -106,6 +103,25 @@ def _predicted(problem: Problem, part: Fit, held: np.ndarray) -> _Predicted:
     return _Predicted(
         e - np.einsum("cmi,ci->cm", pull, score), np.sqrt(variance), _swing(problem, part, unknown, held)
     )
+
+
+def _own(problem: Problem, part: Fit, active: Active) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """What clusters have of their own: a flat vector with the random ones at their centre, spreads, which are random.
+
+    Effects' weights are random; of the base model those that its fit integrates out are. Spreads are (cluster, local).
+    """
+    x, index = part.x.copy(), active.local_index
+    blocks = [b for b in active.blocks if b.local]
+    weights = [0.0 if b.owner is None else part.spread[b.owner] for b in blocks]
+    sd = np.tile(np.repeat(weights, [b.size for b in blocks]), (problem.n_cluster, 1))
+    base = np.repeat([b.owner is None for b in blocks], [b.size for b in blocks]).astype(bool)
+    x[index[:, ~base]] = 0.0
+    if problem.volume is None:
+        return x, sd, ~base
+    prior = project(problem, part)
+    x[index[:, base]] = prior.origin[index[:, base]]
+    sd[:, base] = prior.own.spread[:, base]
+    return x, sd, ~base | (sd > 0).all(axis=0)
 
 
 def _swing(problem: Problem, part: Fit, unknown: np.ndarray, held: np.ndarray) -> np.ndarray:

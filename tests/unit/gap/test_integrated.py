@@ -59,7 +59,7 @@ def fading(time, power=None):
         numpyro.sample("power", dist.Normal(expected, noise), obs=power)
 
 
-def of_fading(seed, drop=0.0, runs=20, slots=24):
+def of_fading(seed, drop=0.0, tone=0.0, runs=20, slots=24):
     rng = np.random.default_rng(seed)
     time = np.tile(np.arange(slots) * 1.0, (runs, 1))
     fade, state = np.zeros((runs, slots)), np.zeros(runs)
@@ -67,6 +67,7 @@ def of_fading(seed, drop=0.0, runs=20, slots=24):
         state = 0.8 * state + rng.normal(size=runs)
         fade[:, slot] = state
     power = -68.0 + fade + 1.2 * rng.normal(size=(runs, slots)) - drop * (time > 15)
+    power += tone * np.sin(2 * np.pi * time / 6)
     return {"time": jnp.asarray(time), "power": jnp.asarray(power)}
 
 
@@ -147,6 +148,23 @@ def test_a_state_for_every_reading_is_no_gap(drop):
         assert abs(found.causes[0].size[0].mean - drop) < 1.0
     else:
         assert found.verdict == "NO_GAP"
+
+
+def test_what_no_candidate_explains_is_seen_at_its_site_beside_many_states():
+    """States that are free at each reading could follow it: their spread must not take it with it."""
+    found = diagnose(
+        fading,
+        of_fading(1, tone=1.5),
+        [DROP, WARM],
+        key=KEY,
+        engine=Laplace(draws=100),
+        settings=SETTINGS,
+    )
+    assert found.verdict == "UNLISTED"
+    assert found.sections["unlisted"]["sites"][0] == "expected"
+    before = found.sections["remainder"]["before"]
+    assert 0.85 < before["coverage"] < 0.95  # new runs, their states unknown
+    assert 0.9 < before["error_ratio"] < 1.1
 
 
 def test_a_broken_model_with_states_says_what_breaks():
