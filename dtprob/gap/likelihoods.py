@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpyro.distributions as dist
 
 from dtprob.effects.distributions import ComplexStudentT
-from dtprob.gap import residuals
+from dtprob.gap import discrete, residuals
 from dtprob.gap.residuals import Parameters
 from dtprob.models.complex_normal import ComplexNormal
 
@@ -85,9 +85,33 @@ def _weibull_respread(p: Parameters, step: jax.Array) -> Parameters:
     return {**p, "concentration": p["concentration"] * jnp.exp(change), "scale": scale}
 
 
+def _to_odds(p: Parameters, step: jax.Array) -> Parameters:
+    """Other log odds of the same total concentration."""
+    change = step / residuals.beta_spread(p)[2]
+    up, down = (jnp.exp(sign * change / p[n]) for sign, n in ((1, "concentration1"), (-1, "concentration0")))
+    return {**p, "concentration1": p["concentration1"] * up, "concentration0": p["concentration0"] * down}
+
+
+def _beta_respread(p: Parameters, step: jax.Array) -> Parameters:
+    """Another total concentration of the same log odds."""
+    first, second, odds_spread, size_spread = residuals.beta_spread(p)
+    change = step / size_spread / odds_spread**2
+    return {
+        **p,
+        "concentration1": p["concentration1"] * jnp.exp(change * second / p["concentration1"]),
+        "concentration0": p["concentration0"] * jnp.exp(change * first / p["concentration0"]),
+    }
+
+
+def _counts_respread(p: Parameters, step: jax.Array) -> Parameters:
+    """Another concentration of counts at the same mean."""
+    factor = jnp.exp(step / (p["concentration"] * discrete.counts_spread(p)))
+    return {**p, "concentration": p["concentration"] * factor, "rate": p["rate"] * factor}
+
+
 def _to_logits(p: Parameters, step: jax.Array) -> Parameters:
     """Logits that shift the row by the step; less far where the outcome is nearly certain."""
-    return {**p, "logits": p["logits"] + step / jnp.maximum(residuals.logits_deviation(p), _CERTAIN)}
+    return {**p, "logits": p["logits"] + step / jnp.maximum(discrete.logits_deviation(p), _CERTAIN)}
 
 
 def _binomial(total_count: jax.Array, **chance: Any) -> Any:
@@ -101,8 +125,8 @@ _SCALED: Final[Mapping[str, Any]] = {
     "log_scale": 0.5**0.5,
 }
 _CLASSES: Final[Mapping[str, Any]] = {
-    "residual": residuals.categorical_residual,
-    "shift": residuals.categorical_shift,
+    "residual": discrete.categorical_residual,
+    "shift": discrete.categorical_shift,
     "is_outcome": True,
 }
 
@@ -192,33 +216,62 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         relocate=_grown("scale", lambda p: 1 / p["concentration"]),
         respread=_weibull_respread,
     ),
+    "Beta": Likelihood(
+        dist.Beta,
+        ("concentration1", "concentration0"),
+        residuals.beta_residual,
+        residuals.beta_shift,
+        located=1,
+        relocate=_to_odds,
+        respread=_beta_respread,
+    ),
+    "VonMises": Likelihood(
+        dist.VonMises,
+        ("loc", "concentration"),
+        residuals.von_mises_residual,
+        residuals.von_mises_shift,
+        located=1,
+        relocate=_to_loc(lambda p: 1 / residuals.von_mises_spread(p)[1]),
+        respread=_grown(
+            "concentration", lambda p: 1 / (p["concentration"] * residuals.von_mises_spread(p)[2])
+        ),
+    ),
+    "GammaPoisson": Likelihood(
+        dist.GammaPoisson,
+        ("concentration", "rate"),
+        discrete.counts_residual,
+        discrete.counts_shift,
+        located=1,
+        relocate=_grown("rate", lambda p: -discrete.counts_deviation(p) * p["rate"] / p["concentration"]),
+        respread=_counts_respread,
+    ),
     "Poisson": Likelihood(
         dist.Poisson,
         ("rate",),
-        residuals.poisson_residual,
-        residuals.poisson_shift,
+        discrete.poisson_residual,
+        discrete.poisson_shift,
         relocate=_grown("rate", lambda p: p["rate"] ** -0.5),
     ),
     "BernoulliLogits": Likelihood(
         lambda logits: dist.Bernoulli(logits=logits),
         ("logits",),
-        residuals.bernoulli_residual,
-        residuals.bernoulli_shift,
+        discrete.bernoulli_residual,
+        discrete.bernoulli_shift,
         relocate=_to_logits,
         is_outcome=True,
     ),
     "BernoulliProbs": Likelihood(
-        dist.Bernoulli, ("probs",), residuals.probs_residual, residuals.probs_shift, is_outcome=True
+        dist.Bernoulli, ("probs",), discrete.probs_residual, discrete.probs_shift, is_outcome=True
     ),
     "BinomialLogits": Likelihood(
         _binomial,
         ("total_count", "logits"),
-        residuals.bernoulli_residual,
-        residuals.bernoulli_shift,
+        discrete.bernoulli_residual,
+        discrete.bernoulli_shift,
         relocate=_to_logits,
     ),
     "BinomialProbs": Likelihood(
-        _binomial, ("total_count", "probs"), residuals.probs_residual, residuals.probs_shift
+        _binomial, ("total_count", "probs"), discrete.probs_residual, discrete.probs_shift
     ),
     "CategoricalLogits": Likelihood(
         lambda logits: dist.Categorical(logits=logits), ("logits",), **_CLASSES, trailing={"logits": 1}
@@ -226,3 +279,12 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
     "CategoricalProbs": Likelihood(dist.Categorical, ("probs",), **_CLASSES, trailing={"probs": 1}),
 }
 """By the name of the distribution's class."""
+
+SAME: Final[Mapping[str, str]] = {
+    "NegativeBinomial2": "GammaPoisson",
+    "NegativeBinomialLogits": "GammaPoisson",
+    "NegativeBinomialProbs": "GammaPoisson",
+    "BetaProportion": "Beta",
+    "Chi2": "Gamma",
+}
+"""Classes that are another one with parameters of their own, which they turn into its."""

@@ -1,4 +1,4 @@
-"""Scores of observations as whitened regression rows, for each family of distributions.
+"""Scores of observations as whitened regression rows, for each family of continuous distributions.
 
 Rows e(y) have mean zero and, up to directions that no change of the parameters takes, unit covariance under the model; a
 change of the parameters shifts them, to first order, by s. So e . s is the score along the change and s . s its Fisher
@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import digamma, polygamma
+from jax.scipy.special import digamma, i0e, i1e, polygamma
 
 from dtprob.effects.distributions import ComplexStudentT
 
@@ -150,6 +150,50 @@ def weibull_shift(p: Parameters, t: Parameters) -> jax.Array:
     return jnp.stack([size, t["concentration"] / k * jnp.pi / jnp.sqrt(6.0)])
 
 
+def beta_spread(p: Parameters) -> tuple[jax.Array, jax.Array, jax.Array, jax.Array]:
+    """psi'(a), psi'(b), and the roots of the information on a - b along the log odds and on a + b beside it."""
+    first, second = polygamma(1, p["concentration1"]), polygamma(1, p["concentration0"])
+    both = polygamma(1, p["concentration1"] + p["concentration0"])
+    total = first + second
+    return first, second, jnp.sqrt(total), jnp.sqrt(first * second / total - both)
+
+
+def beta_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a beta distribution: its log odds, and how far it is from both ends."""
+    a, b = p["concentration1"], p["concentration0"]
+    first, _, odds_spread, size_spread = beta_spread(p)
+    yes = jnp.log(value) - digamma(a) + digamma(a + b)
+    odds = yes - jnp.log1p(-value) + digamma(b) - digamma(a + b)
+    return jnp.stack([odds / odds_spread, (yes - first / odds_spread**2 * odds) / size_spread])
+
+
+def beta_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a beta distribution."""
+    first, second, odds_spread, size_spread = beta_spread(p)
+    odds = t["concentration1"] * first - t["concentration0"] * second
+    return jnp.stack([odds / odds_spread, (t["concentration1"] + t["concentration0"]) * size_spread])
+
+
+def von_mises_spread(p: Parameters) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Mean cosine A, and the roots of the information on the location, k A, and on the concentration k, 1 - A / k - A^2."""
+    k = p["concentration"]
+    mean = i1e(k) / i0e(k)
+    return mean, jnp.sqrt(k * mean), jnp.sqrt(1 - mean / k - mean**2)
+
+
+def von_mises_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a von Mises distribution (Mardia and Jupp, Directional Statistics, 2000, section 5.3)."""
+    mean, location, spread = von_mises_spread(p)
+    away = value - p["loc"]
+    return jnp.stack([p["concentration"] * jnp.sin(away) / location, (jnp.cos(away) - mean) / spread])
+
+
+def von_mises_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a von Mises distribution."""
+    _, location, spread = von_mises_spread(p)
+    return jnp.stack([t["loc"] * location, t["concentration"] * spread])
+
+
 def multivariate_normal_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of the innovations of the entries in their order, of their squares, and of their products with later ones.
 
@@ -186,67 +230,3 @@ def multivariate_normal_log_prob(p: Parameters, value: jax.Array) -> jax.Array:
     """Log density of each entry given those before it."""
     scale = jnp.diagonal(p["scale_tril"], axis1=-2, axis2=-1)
     return dist.Normal(0.0, 1.0).log_prob(_innovations(p, value)) - jnp.log(scale)
-
-
-def poisson_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """Rows of a Poisson distribution."""
-    return ((value - p["rate"]) / jnp.sqrt(p["rate"]))[None]
-
-
-def poisson_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a Poisson distribution."""
-    return (t["rate"] / jnp.sqrt(p["rate"]))[None]
-
-
-def bernoulli_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """Rows of a Bernoulli or binomial distribution of logits; finite where the probability rounds to zero or one.
-
-    Nothing was tried where a binomial's count is zero, and nothing is said.
-    """
-    n, half = p.get("total_count", jnp.ones(())), p["logits"] / 2
-    yes = jnp.where(value > 0, value * jnp.exp(-half), 0.0)
-    no = jnp.where(value < n, (n - value) * jnp.exp(half), 0.0)
-    return ((yes - no) / jnp.sqrt(jnp.maximum(n, 1.0)))[None]
-
-
-def logits_deviation(p: Parameters) -> jax.Array:
-    """Standard deviation of the number of successes."""
-    n = p.get("total_count", jnp.ones(()))
-    return jnp.sqrt(n * jax.nn.sigmoid(p["logits"]) * jax.nn.sigmoid(-p["logits"]))
-
-
-def bernoulli_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a Bernoulli or binomial distribution of logits."""
-    return (t["logits"] * logits_deviation(p))[None]
-
-
-def probs_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """Rows of a Bernoulli or binomial distribution of probabilities."""
-    n = p.get("total_count", jnp.ones(()))
-    return ((value - n * p["probs"]) / jnp.sqrt(jnp.maximum(n, 1.0) * p["probs"] * (1 - p["probs"])))[None]
-
-
-def probs_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a Bernoulli or binomial distribution of probabilities."""
-    n = p.get("total_count", jnp.ones(()))
-    return (t["probs"] * jnp.sqrt(n / (p["probs"] * (1 - p["probs"]))))[None]
-
-
-def _probability(p: Parameters) -> jax.Array:
-    return p["probs"] if "probs" in p else jax.nn.softmax(p["logits"])
-
-
-def categorical_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """One row for each outcome; together they sum to zero along the roots of the probabilities."""
-    probability = _probability(p)
-    one_hot = jax.nn.one_hot(value, probability.shape[-1], dtype=probability.dtype)
-    return jnp.moveaxis((one_hot - probability) / jnp.sqrt(jnp.maximum(probability, 1e-30)), -1, 0)
-
-
-def categorical_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a categorical distribution."""
-    probability = _probability(p)
-    if "logits" in t:
-        mean = jnp.sum(probability * t["logits"], axis=-1, keepdims=True)
-        return jnp.moveaxis(jnp.sqrt(probability) * (t["logits"] - mean), -1, 0)
-    return jnp.moveaxis(t["probs"] / jnp.sqrt(jnp.maximum(probability, 1e-30)), -1, 0)

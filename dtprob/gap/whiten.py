@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpyro.distributions as dist
 
 from dtprob.errors import InputError
-from dtprob.gap.likelihoods import LIKELIHOODS
+from dtprob.gap.likelihoods import LIKELIHOODS, SAME
 from dtprob.gap.residuals import Parameters
 
 _WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
@@ -54,7 +54,7 @@ def observation(fn: Any, value: Any, name: str) -> Observation:
             own = own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
             mask = own if mask is None else mask & own
         fn = fn.base_dist
-    family = type(fn).__name__
+    family = SAME.get(type(fn).__name__, type(fn).__name__)
     if family not in LIKELIHOODS:
         raise InputError(
             f"observed site {name!r}",

@@ -1,4 +1,4 @@
-"""Observations of many kinds are diagnosed: counts of received packets, fading powers, shadowing that neighbours share."""
+"""Observations of many kinds are diagnosed: counts of packets, fading powers, phases, shadowing that neighbours share."""
 
 import jax
 import jax.numpy as jnp
@@ -36,7 +36,18 @@ def shadowed(level):
     return dist.MultivariateNormal(level, scale_tril=deviation * ROOT)
 
 
-OBSERVED = {"received": received, "faded": faded, "shadowed": shadowed}
+def bursty(level):
+    """Packets that come in bursts, 20 times 10^(level / 10) on average."""
+    concentration = numpyro.sample("concentration", dist.LogNormal(1.0, 1.0))
+    return dist.NegativeBinomial2(jnp.exp(0.23 * level + 3.0), concentration).to_event(1)
+
+
+def turned(level):
+    """A phase in radians that turns by .4 for each unit."""
+    return dist.VonMises(0.4 * level, 2.0).to_event(1)
+
+
+OBSERVED = {"received": received, "faded": faded, "shadowed": shadowed, "bursty": bursty, "turned": turned}
 
 
 def streets(kind):
@@ -82,6 +93,10 @@ def table(kind, loss, seed):
             y = rng.binomial(PACKETS, 1 / (1 + np.exp(-0.4 * level)))
         case "faded":
             y = rng.gamma(4.0, np.exp(0.23 * level) / 4.0)
+        case "bursty":
+            y = rng.poisson(rng.gamma(5.0, np.exp(0.23 * level + 3.0) / 5.0))
+        case "turned":
+            y = rng.vonmises(0.4 * level, 2.0)
         case _:
             y = level + 1.5 * rng.standard_normal((STREETS, PLACES)) @ np.asarray(ROOT).T
     return {"distance": jnp.asarray(distance), "blocked": jnp.asarray(blocked), "y": jnp.asarray(y)}

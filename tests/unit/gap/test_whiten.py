@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from scipy import stats
 
 from dtprob.effects.distributions import ComplexStudentT
 from dtprob.errors import InputError
-from dtprob.gap import whiten
+from dtprob.gap import discrete, whiten
 from dtprob.gap.likelihoods import LIKELIHOODS
 from dtprob.models.complex_normal import ComplexNormal
 
@@ -82,6 +83,21 @@ FAMILIES = {
         dist.Weibull,
         {"scale": strong(1.8), "concentration": strong(2.4)},
         {"scale": strong(0.5), "concentration": strong(-0.4)},
+    ),
+    "Beta": (
+        dist.Beta,
+        {"concentration1": strong(3.2), "concentration0": strong(0.8)},
+        {"concentration1": strong(0.5), "concentration0": strong(-0.3)},
+    ),
+    "VonMises": (
+        dist.VonMises,
+        {"loc": strong(2.8), "concentration": strong(3.1)},
+        {"loc": strong(0.4), "concentration": strong(0.7)},
+    ),
+    "GammaPoisson": (
+        dist.GammaPoisson,
+        {"concentration": strong(2.6), "rate": strong(0.1)},
+        {"concentration": strong(0.4), "rate": strong(-0.02)},
     ),
     "BinomialLogits": (
         lambda total_count, logits: dist.Binomial(jnp.asarray(total_count, int), logits=logits),
@@ -250,7 +266,7 @@ def test_samples_follow_the_observation():
 
 def test_unknown_distribution_is_refused_by_name():
     others = [
-        dist.Beta(2.0, 1.0),
+        dist.BetaBinomial(2.0, 1.0, 3),
         dist.InverseGamma(2.0, 1.0),  # made of a gamma, an exponential, a normal
         dist.Pareto(1.0, 2.0),
         dist.LeftTruncatedDistribution(dist.Normal(), low=0.0),
@@ -259,6 +275,35 @@ def test_unknown_distribution_is_refused_by_name():
     for other in others:
         with pytest.raises(InputError, match=rf"observed site 'y'.*{type(other).__name__}"):
             whiten.observation(other, jnp.full((), 0.5), "y")
+
+
+def test_information_on_the_spread_of_counts():
+    """Against the sum over all counts."""
+    mean, concentration = (a.ravel() for a in np.meshgrid([0.05, 3.0, 400.0, 3e5], [0.3, 5.0, 200.0]))
+    p = {"concentration": strong(concentration), "rate": strong(concentration / mean)}
+    found = np.asarray(jax.jit(discrete.counts_spread)(p)) ** 2
+    for m, c, information in zip(mean, concentration, found, strict=True):
+        shape = stats.nbinom(c, c / (c + m))
+        k = np.arange(0.0, int(shape.isf(1e-13)) + 10)
+        whole = np.sum(shape.sf(k) / (c + k) ** 2) - m / (c * (c + m))
+        assert information == pytest.approx(whole, rel=2e-3), (m, c)
+
+
+@pytest.mark.parametrize(
+    "fn",
+    [
+        dist.NegativeBinomial2(4.0, 2.5),
+        dist.NegativeBinomial(5, probs=0.4),
+        dist.NegativeBinomial(5, logits=0.4),
+        dist.BetaProportion(0.7, 12.0),
+        dist.Chi2(3.0),
+    ],
+    ids=lambda fn: type(fn).__name__,
+)
+def test_the_same_distribution_with_other_parameters(fn):
+    value = strong(0.3 if isinstance(fn, dist.Beta) else 3.0)
+    observed = whiten.observation(fn, value, "y")
+    np.testing.assert_allclose(whiten.log_prob(observed, value), fn.log_prob(value), rtol=1e-6)
 
 
 def test_entries_of_a_vector_have_its_density_together():
