@@ -1,9 +1,9 @@
-"""Ways for a perturbation to vary along an axis: smoothly, as a ripple, with the data's columns, or by their groups."""
+"""Ways for a perturbation to vary: smoothly along an axis, as a ripple, with a column of the data or a site, by groups."""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, cast
 
@@ -23,6 +23,10 @@ _CROSSED: Final = 3
 _MOST_PAIRS: Final = 6
 _LONGEST: Final = 24
 """Period of the longest cycle that is looked for; longer ones show as ripples."""
+_LARGEST: Final = 1 << 18
+"""Numbers that the curves over one quantity may take in a band."""
+_FINEST_OVER: Final = 64
+"""Half waves of the finest ripple over a quantity of several axes or a site."""
 _TURNS: Final = 24
 """Times that a cycle has to come round: sums of a few entries are far from normal."""
 
@@ -72,6 +76,49 @@ class Curves:
         return _ripple(self.ripple.over, self.ripple.lowest + first, np.asarray(self.values[first:stop]))
 
 
+@dataclass(frozen=True)
+class Quantity:
+    """What the model computes or the data tell at positions of some axes, over which a perturbation may vary.
+
+    Attributes:
+        name: the site or the column.
+        axes: along which it varies.
+        values: at their positions.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    values: np.ndarray
+
+    def kept(self, axes: Sequence[str], shape: Sequence[int]) -> tuple[int, ...] | None:
+        """Which of a site's axes are this one's; None where it lies on others."""
+        if self.values.shape == tuple(shape):
+            return tuple(range(len(shape)))
+        place = [axes.index(axis) for axis in self.axes if axis in axes]
+        whole = len(place) == len(self.axes) and place == sorted(place)
+        return tuple(place) if whole and self.values.shape == tuple(shape[i] for i in place) else None
+
+    def curves(self) -> Iterator[Curves]:
+        """Smooth, and ripples over its values."""
+        flat = self.values.reshape(-1)
+        if _ORDER * flat.size > _LARGEST:
+            return
+        yield Curves(f"along {self.name}", _smooth(flat))
+        finest = min(_FINEST_OVER, _LARGEST // flat.size)
+        yield from _ripples(self.name, (flat - flat.min()) / np.ptp(flat), finest)
+
+
+def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | None:
+    """A real site or column, on the axes along which it varies; None where too few of its values differ."""
+    if not np.issubdtype(values.dtype, np.floating) or not np.isfinite(values).all():
+        return None
+    wide = [i for i, n in enumerate(values.shape) if n > 1 and (values != values.take([0], i)).any()]
+    values = values[tuple(slice(None) if i in wide else 0 for i in range(values.ndim))]
+    if len(np.unique(values)) < _SMOOTH_FROM:
+        return None
+    return Quantity(name, tuple(axes[i] for i in wide), values)
+
+
 def curves(problem: Problem, axis: str, size: int) -> tuple[Curves, ...]:
     """All curves along an axis of some positions, each label once; none where the axis is short."""
     if size < _SMOOTH_FROM:
@@ -88,7 +135,7 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     for name, column in columns.items():
         groups, index = np.unique(column, return_inverse=True)
         if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
-            yield Curves(f"along {name}", _waves(_rank(column), 1, _ORDER))
+            yield Curves(f"along {name}", _smooth(column))
             yield from _ripples(name, (column - column.min()) / np.ptp(column))
         else:
             grouped = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
@@ -109,9 +156,9 @@ def cycles(size: int, over: str) -> tuple[Curves, ...]:
     )
 
 
-def _ripples(over: str, place: np.ndarray) -> Iterator[Curves]:
+def _ripples(over: str, place: np.ndarray, finest: int = _FINEST) -> Iterator[Curves]:
     """Octaves of ripples over places (size,) in (0, 1)."""
-    low, finest = _ORDER + 1, min(len(place) - 1, _FINEST)
+    low, finest = _ORDER + 1, min(len(place) - 1, finest)
     while low <= finest:
         high = min(2 * (low - 1), finest)
         yield _ripple(over, low, _waves(place, low, high))
@@ -127,6 +174,15 @@ def _ripple(over: str, low: int, values: np.ndarray) -> Curves:
 def _waves(place: np.ndarray, low: int, high: int) -> np.ndarray:
     """Cosines of low to high half waves over places (size,) in (0, 1)."""
     return np.cos(np.pi * np.outer(np.arange(low, high + 1), place))
+
+
+def _smooth(column: np.ndarray) -> np.ndarray:
+    """Cosines of few half waves over the ranks (size,), and a line over the values: far ones have leverage.
+
+    The line may cross zero anywhere, so a constant is there too: not every model has a level of its own.
+    """
+    line = (column - column.mean()) / (2**0.5 * column.std())
+    return np.concatenate([_waves(_rank(column), 1, _ORDER), line[None], np.full_like(line, 0.5**0.5)[None]])
 
 
 def _rank(column: np.ndarray) -> np.ndarray:

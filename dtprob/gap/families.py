@@ -14,7 +14,7 @@ from typing import Final, final
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.gap.curves import Curves, cycles
+from dtprob.gap.curves import Curves, Quantity, cycles
 from dtprob.gap.problem import Problem
 
 _ROWS: Final = 8
@@ -23,6 +23,7 @@ _COLUMNS: Final = 16
 """Entries beside the rows up to which each is looked at."""
 
 type Along = Callable[[str, int], Sequence[Curves]]
+type Over = Sequence[tuple[Quantity, Sequence[Curves]]]
 
 
 @final
@@ -175,14 +176,15 @@ def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> n
     return np.stack(found)
 
 
-def families(along: Along, site: Site) -> Iterator[tuple[Family, np.ndarray]]:
+def families(along: Along, over: Over, site: Site) -> Iterator[tuple[Family, np.ndarray]]:
     """Every family of a site with its scores (1 + replicate, entry), one after another.
 
     Args:
         along: the curves along an axis of a size.
+        over: quantities with the curves over them.
         site: what is perturbed.
     """
-    patterns = list(_patterns(along, site))
+    patterns = list({(p.label, p.kept): p for p in _patterns(along, over, site)}.values())
     for kind, factor in site.kinds.items():
         sums = _summed(site.entries(kind), {pattern.kept for pattern in patterns})
         summed = {kept: Summed(values) for kept, values in sums.items()}
@@ -200,13 +202,16 @@ def _summed(entries: np.ndarray, wanted: Collection[tuple[int, ...]]) -> dict[tu
     return summed
 
 
-def _patterns(along: Along, site: Site) -> Iterator[Pattern]:
-    """Pooled along axes, and along curves on one axis."""
+def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
+    """Pooled along axes, and along curves on one axis or over a quantity."""
     for kept in _kept_axes(site.value.shape):
         yield Pattern(" x ".join(site.axes[i] for i in kept) or "common", kept)
     for i, axis in enumerate(site.axes):
         for found in along(axis, site.value.shape[i]):
             yield Pattern(found.label, (i,), found)
+    for quantity, all_curves in over:
+        if (kept := quantity.kept(site.axes, site.value.shape)) is not None:
+            yield from (Pattern(found.label, kept, found) for found in all_curves)
     yield from _cycles(site)
 
 

@@ -7,7 +7,7 @@ cluster's own, or a spread, widens the prediction there. Both are judged on clus
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Final
 
@@ -87,16 +87,12 @@ def model_remainder(
         best: the optimistic floor of the causes, total log likelihood.
         key: for the bootstrap over clusters.
     """
-    problem, fitted = view.problem, view.fitted
+    problem = view.problem
     named = {f"{_NAME}[{i}]": s for i, s in enumerate(shortlist(problem, view.location.suspects))}
     if not named:
         return None
-    at = problem.compiled.sites(fitted.x)
-    positive = {s.site for s in named.values() if s.rows is None and _is_positive(at[s.site])}
-    fields = [field_of(problem, n, s, positive=s.site in positive) for n, s in named.items()]
-    own = [n for n, s in named.items() if _is_by_cluster(problem, s)]
-    wider = problem.with_fields(fields, own)
-    full = _forward(wider, replace(fitted, x=wider.translate(fitted.x, problem)), tuple(named))
+    wider, fitted = _wider(view, named)
+    full = _forward(wider, fitted, tuple(named))
     taken = [n for n in named if n in full.effects]
     if not taken:
         return None
@@ -113,6 +109,36 @@ def model_remainder(
         calibration(problem, folds),
         calibration(wider, parts),
     )
+
+
+def alone(view: View) -> float:
+    """Log evidence of the fit with the one family of a site that has the most; minus infinity where none is suspected.
+
+    Families of which each cluster has its own weights are left out: they follow anything.
+    """
+    problem = view.problem
+    shared = [s for s in view.location.suspects if not _is_per_cluster(problem, s)]
+    apart = {(s.site, round(s.evidence, 3)): s for s in shared if _size(problem, s) <= _WEIGHTS}
+    named = {f"{_NAME}[{i}]": s for i, s in enumerate(list(apart.values())[:_TRIED])}
+    if not named:
+        return -np.inf
+    wider, fitted = _wider(view, named)
+    fits = (
+        fitting.fit(wider, fitted.x, (*fitted.effects, name), spread={**fitted.spread, name: 1.0})
+        for name in named
+    )
+    return max(one.log_evidence for one in fits)
+
+
+def _wider(view: View, named: Mapping[str, Suspect]) -> tuple[Problem, fitting.Fit]:
+    """The problem with families as fields, and the view's fit in its coordinates."""
+    problem, fitted = view.problem, view.fitted
+    at = problem.compiled.sites(fitted.x)
+    positive = {s.site for s in named.values() if s.rows is None and _is_positive(at[s.site])}
+    fields = [field_of(problem, n, s, positive=s.site in positive) for n, s in named.items()]
+    own = [n for n, s in named.items() if _is_by_cluster(problem, s)]
+    wider = problem.with_fields(fields, own)
+    return wider, replace(fitted, x=wider.translate(fitted.x, problem))
 
 
 def shortlist(problem: Problem, suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:

@@ -16,6 +16,7 @@ import numpy as np
 from dtprob.gap import fit as fitting
 from dtprob.gap.problem import Problem
 from dtprob.gap.refit import at_null_except, refit, starting_points, without
+from dtprob.gap.remainder import alone
 from dtprob.gap.settings import Settings
 from dtprob.gap.trials import Say, Start, Trials, best, credit, tried
 from dtprob.gap.view import View, view
@@ -25,7 +26,8 @@ _RETURNS: Final = 3
 _REVISIONS: Final = 4
 """Earlier choices that are looked at again after each step."""
 _NEARLY: Final = 3.0
-"""Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect."""
+"""Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect; by which
+one family of a site has to be better than a random field that stands in for it."""
 _UNDERSTATED: Final = 0.15
 """Share of a gain that first-order scores may miss."""
 
@@ -62,8 +64,9 @@ class Search:
 def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> Search:
     """Look for the effects that are missing, one after another; of several ways the one whose end has most credit stands.
 
-    Where a random field was accepted, which can imitate several effects at once, the search goes on without it too. Where
-    a pair promises as much as was reached, it is started from that pair.
+    Where a random field was accepted, which can imitate several effects at once, the search goes on without it too. A field
+    alone that one family of a site beats is taken back: it stands in for an effect that is not known. Where a pair promises
+    as much as was reached, the search is started from that pair.
 
     Args:
         problem: the model and candidates on their data.
@@ -88,11 +91,15 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     if pair is not None:
         say(f"starting from {pair[0]} and {pair[1]} together")
         both = _refitted_with(steps[0].view, pair, settings)
-        others = _forward(
-            both.problem, both.fitted, jax.random.fold_in(key, 2), settings, say, base=base, banned=field
-        )
+        key = jax.random.fold_in(key, 2)
+        others = _forward(both.problem, both.fitted, key, settings, say, base=base, banned=field)
         ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
+    first, bare = ways[0][-1].view.fitted, steps[0].view
+    if first.effects == (field,):
+        say(f"looking whether {field} stands in for what varies more simply at a site")
+        if alone(bare) > credit(problem, first, base) + _NEARLY:
+            ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
 

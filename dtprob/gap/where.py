@@ -12,11 +12,12 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
+import equinox as eqx
 import numpy as np
 
 from dtprob.gap.bootstrap import Replicates, more
 from dtprob.gap.coordinates import CoordinateFinding, scan_coordinates
-from dtprob.gap.curves import curves
+from dtprob.gap.curves import Quantity, curves, quantity
 from dtprob.gap.families import Site, deterministic, families, observed, shifted
 from dtprob.gap.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.fit import Fit
@@ -100,7 +101,8 @@ def _test_sites(problem: Problem, fitted: Fit, projection: Projection, drawn: Re
     found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
     found += observed(problem, np.concatenate([drawn.observed[None], drawn.projected]))
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    tested = [(site, [family_test(*family) for family in families(along, site)]) for site in found]
+    over = [(q, tuple(q.curves())) for q in _quantities(problem, found)]
+    tested = [(site, [family_test(*family) for family in families(along, over, site)]) for site in found]
     null = [test.null for _, tests in tested for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
     findings = [
@@ -108,6 +110,24 @@ def _test_sites(problem: Problem, fitted: Fit, projection: Projection, drawn: Re
         for site, tests in tested
     ]
     return _Tested(tested, findings)
+
+
+def _quantities(problem: Problem, sites: Sequence[Site]) -> Iterator[Quantity]:
+    """What the model computes and the data tell along several axes: a perturbation may vary over it."""
+    arguments = {site.argument for site in problem.declaration.observed.values()}
+    columns = {
+        name: (site.axes, np.asarray(values))
+        for name, values in problem.data.items()
+        for site in problem.declaration.observed.values()
+        if name not in arguments
+        and eqx.is_array_like(values)
+        and np.ndim(values) > 1
+        and np.shape(values) == site.shape
+    }
+    computed = {site.name: (site.axes, site.value) for site in sites if site.rows is None}
+    for name, (axes, values) in (columns | computed).items():
+        if (found := quantity(name, axes, values)) is not None:
+            yield found
 
 
 def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:

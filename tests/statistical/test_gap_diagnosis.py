@@ -337,3 +337,42 @@ def test_a_pair_of_parameters_is_one_effect():
     assert (found.verdict, found.causes[0].effects) == ("LISTED", ("pair",))
     assert [s.name for s in found.causes[0].size] == ["c_0", "c_1"]
     assert abs(found.causes[0].size[1].mean - 0.5) < 0.25
+
+
+def town(east, north, power=None):
+    """Power around a base station at the origin, 20 m high; what is in the table are places, not distances."""
+    level = numpyro.sample("level", dist.Normal(-40.0, 20.0))
+    exponent = numpyro.sample("exponent", dist.Normal(3.0, 1.0))
+    error = numpyro.sample("error", dist.LogNormal(0.0, 1.0))
+    distance = numpyro.deterministic("distance", jnp.sqrt(east**2 + north**2 + 400.0))
+    expected = numpyro.deterministic("expected", level - 10 * exponent * jnp.log10(distance))
+    with numpyro.plate("place", len(east)):
+        numpyro.sample("power", dist.Normal(expected, error), obs=power)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "labels"),
+    [
+        (lambda distance, _power: 2.0 * np.sin(2 * np.pi * distance / 40), ("ripple in distance, 17 to 32",)),
+        (lambda _distance, power: np.minimum(-95.0 - power, 0.0), ("along distance", "along expected")),
+    ],
+    ids=["a wave from the ground", "a receiver that saturates"],
+)
+def test_what_varies_over_a_quantity_of_the_model_is_seen(wrong, labels):
+    """Neither is a function of a column."""
+    rng = np.random.default_rng(3)
+    east, north = rng.uniform(-300, 300, (2, 300))
+    distance = np.sqrt(east**2 + north**2 + 400.0)
+    power = -35 - 30 * np.log10(distance)
+    power = power + wrong(distance, power) + 2.0 * rng.normal(size=300)
+    data = {"east": jnp.asarray(east), "north": jnp.asarray(north), "power": jnp.asarray(power)}
+    north_side = Effect(
+        "north_side",
+        {"expected": lambda value, p, context: value + p["size"] * (context["north"] > 0)},
+        (Parameter("size", dist.Normal(0.0, 3.0)),),
+    )
+    found = run(town, data, (north_side,), settings=Settings(replicates=100), engine=Laplace(draws=100))
+    assert found.verdict == "UNLISTED"
+    first = found.sections["where"]["sites"][0]
+    assert first["site"] in ("distance", "expected")
+    assert any(label in first["family"] for label in labels)

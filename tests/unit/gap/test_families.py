@@ -9,7 +9,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.gap.curves import curves, cycles
+from dtprob.gap.curves import curves, cycles, quantity
 from dtprob.gap.families import deterministic, families, observed, shifted
 from dtprob.gap.problem import Problem
 from tests.unit.gap.examples import bend, draw, line
@@ -58,8 +58,9 @@ def complex_site(problem, shape=(LENGTH, 3), axes=("row", "antenna")):
 @pytest.mark.parametrize("shape", [(LENGTH, 3), (LENGTH, 8)], ids=["short", "rows in order"])
 def test_scores_are_the_slope_along_what_a_family_perturbs(problem, shape):
     site = complex_site(problem, shape)
+    angle = quantity("angle", site.axes, np.random.default_rng(4).normal(size=shape))
     seen = set()
-    for family, scores in families(partial(curves, problem), site):
+    for family, scores in families(partial(curves, problem), [(angle, tuple(angle.curves()))], site):
         step = family.step(scores[0], np.ones(scores.shape[1]), site.value)
         slope = np.real(np.sum(site.gradients * step, axis=(1, 2)))  # d = Re(g dz), as JAX has it
         np.testing.assert_allclose(slope, scores @ scores[0], rtol=1e-6, atol=1e-9)
@@ -74,7 +75,7 @@ def test_scores_are_the_slope_along_what_a_family_perturbs(problem, shape):
 
 def test_a_neighbour_leaks_into_an_entry(problem):
     site = complex_site(problem)
-    found = {family.label: family for family, _ in families(partial(curves, problem), site)}
+    found = {family.label: family for family, _ in families(partial(curves, problem), (), site)}
     step = found["from the next antenna, common"].step(np.array([1.0, 0.0]), np.ones(2), site.value)
     np.testing.assert_allclose(step, np.roll(site.value, -1, axis=1))
 
@@ -115,6 +116,34 @@ def test_a_column_of_an_axis_name_stands_for_its_positions(problem):
     np.testing.assert_allclose(ripple.values[0], np.cos(5 * np.pi * scaled), atol=1e-12)
 
 
+def test_a_quantity_lies_on_the_axes_along_which_it_varies():
+    values = np.linspace(0, 1, LENGTH)[:, None, None] + np.linspace(0, 3, 4) + np.zeros((LENGTH, 3, 1))
+    found = quantity("delay", ("link", "antenna", "path"), values)
+    assert found.axes == ("link", "path")
+    np.testing.assert_array_equal(found.values, values[:, 0])
+    assert found.kept(("link", "antenna", "path"), (LENGTH, 3, 4)) == (0, 2)
+    assert found.kept(("link", "path"), (LENGTH, 4)) == (0, 1)
+    assert found.kept(("path", "link"), (4, LENGTH)) is None
+    assert found.kept(("link", "path"), (LENGTH, 5)) is None
+    assert found.kept(("link", "antenna"), (LENGTH, 3)) is None
+    unnamed = quantity("level", ("level_dim_0",), np.arange(9.0))
+    assert unnamed.kept(("power_dim_0",), (9,)) == (0,)
+    assert quantity("device", ("link",), np.arange(9)) is None
+    assert quantity("height", ("link",), np.array([1.5, 10.0] * 9)) is None
+    assert quantity("gain", ("link",), np.full(9, np.nan)) is None
+
+
+def test_curves_over_a_quantity_are_smooth_in_its_rank_and_ripples_over_its_values():
+    values = np.random.default_rng(0).lognormal(size=(LENGTH, 3))
+    smooth, *ripples = quantity("delay", ("link", "path"), values).curves()
+    order = np.argsort(values.reshape(-1))
+    assert smooth.label == "along delay"
+    assert np.all(np.diff(smooth.values[0][order]) < 0)
+    scaled = (values.reshape(-1) - values.min()) / np.ptp(values)
+    np.testing.assert_allclose(ripples[0].values[1], np.cos(6 * np.pi * scaled), atol=1e-12)
+    assert ripples[-1].label.endswith("to 64 half waves")
+
+
 def test_cycles_of_each_period_take_turns():
     found = cycles(150, "slot")
     assert [c.label for c in found] == [f"every {period} along slot" for period in range(2, 7)]
@@ -129,7 +158,7 @@ def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
     value = np.zeros((21, 8, 2))
     value.reshape(168, 2)[::7, 1] = 1.0
     site = deterministic("load", ("window", "slot", "device"), np.zeros(value.shape), value[None])
-    found = {f.label: (f, s) for f, s in families(partial(curves, problem), site)}
+    found = {f.label: (f, s) for f, s in families(partial(curves, problem), (), site)}
     family, scores = found["additive, every 7 along window and slot"]
     assert np.count_nonzero(scores) == 1
     step = family.step(scores[0], np.full(scores.shape[1], 24.0), site.value)

@@ -15,7 +15,7 @@ from dtprob.effects.effect import FIELD
 from dtprob.gap import closed
 from dtprob.gap import fit as fitting
 from dtprob.gap.calibration import calibration
-from dtprob.gap.curves import curves
+from dtprob.gap.curves import curves, quantity
 from dtprob.gap.families import Family, Pattern, deterministic, families
 from dtprob.gap.fields import common_spread
 from dtprob.gap.problem import Problem
@@ -150,7 +150,8 @@ def test_a_field_moves_its_site_as_its_family_does():
     value = rng.normal(size=(21, 8, 2))
     site = deterministic("load", ("window", "slot", "device"), value, rng.normal(size=(1, 21, 8, 2)))
     seen = []
-    for family, scores in families(partial(curves, problem), site):
+    over = quantity("delay", site.axes, rng.normal(size=value.shape))
+    for family, scores in families(partial(curves, problem), [(over, tuple(over.curves()))], site):
         effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0), positive=False)
         weights = rng.normal(size=effect.shape_of_field(jnp.asarray(value), {}))
         moved = effect.rewrites["load"](value, {"scale": 2.0, FIELD: weights}, {}) - value
@@ -158,7 +159,7 @@ def test_a_field_moves_its_site_as_its_family_does():
         wanted = family.pattern.perturbation(weights.reshape(-1), value.shape, 1)[..., 0] * family.factor
         np.testing.assert_allclose(moved, np.broadcast_to(wanted, value.shape), atol=1e-12)
         seen.append(family.pattern.label)
-    assert "every 7 along window and slot" in seen
+    assert {"every 7 along window and slot", "along delay"} <= set(seen)
 
 
 def test_what_all_clusters_share_carries_over():

@@ -75,9 +75,6 @@ def test_the_error_is_the_root_mean_square():
 WRONG = {
     "regional_bias[x2_high]": lambda truth, x, _: truth - 0.5 * (x[:, 2] > 1 / 3),
     "scale_bias": lambda truth, _x, _rng: 0.6 * truth + 0.3,  # right at another level than the mean one
-    "stale_map": lambda truth, x, rng: (
-        truth + 0.5 * rng.normal(size=(4, 4))[tuple(np.floor(2 * x[:, :2] + 2).astype(int).T)]
-    ),
 }
 
 
@@ -90,6 +87,18 @@ def test_how_the_predictor_errs_is_named(name):
     )
     assert found.causes[0].effects == (name,)
     assert found.causes[0].closed_fraction.mean > 0.5
+
+
+def test_a_map_out_of_date_does_not_stand_in_for_a_wrong_slope():
+    """A field over places can follow a slope that the candidates lack; one curve of the prediction does so better."""
+    data = rows(wrong=WRONG["scale_bias"])
+    offered = catalogue(declare(label_twin, data).sites, data)
+    effects = [e for e in offered if e.family != "scale_bias"]
+    found = diagnose(
+        label_twin, data, effects, key=jax.random.key(1), engine=Laplace(draws=200), settings=SETTINGS
+    )
+    assert found.verdict == "UNLISTED"
+    assert found.sections["unlisted"]["sites"][0] == "predicted_label"
 
 
 @pytest.mark.parametrize("family", ["label_noise", "regional_bias"])
