@@ -12,6 +12,7 @@ import numpy as np
 from scipy import sparse, stats
 
 from dtprob.gap.problem import Problem
+from dtprob.models.declaration import is_unnamed
 
 _SMOOTH_FROM: Final = 6
 _ORDER: Final = 4
@@ -92,7 +93,8 @@ class Quantity:
 
     def kept(self, axes: Sequence[str], shape: Sequence[int]) -> tuple[int, ...] | None:
         """Which of a site's axes are this one's; None where it lies on others."""
-        if self.values.shape == tuple(shape):
+        agree = all(a == b or is_unnamed(a) or is_unnamed(b) for a, b in zip(self.axes, axes, strict=False))
+        if agree and self.values.shape == tuple(shape):
             return tuple(range(len(shape)))
         place = [axes.index(axis) for axis in self.axes if axis in axes]
         whole = len(place) == len(self.axes) and place == sorted(place)
@@ -103,9 +105,7 @@ class Quantity:
         flat = self.values.reshape(-1)
         if _ORDER * flat.size > _LARGEST:
             return
-        yield Curves(f"along {self.name}", _smooth(flat))
-        finest = min(_FINEST_OVER, _LARGEST // flat.size)
-        yield from _ripples(self.name, (flat - flat.min()) / np.ptp(flat), finest)
+        yield from _over(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
 
 
 def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | None:
@@ -130,13 +130,12 @@ def curves(problem: Problem, axis: str, size: int) -> tuple[Curves, ...]:
 def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     place = (np.arange(size) + 0.5) / size
     yield Curves(f"smooth in {axis}", _waves(place, 1, _ORDER))
-    yield from _ripples(axis, place)
+    yield from _ripples(axis, place, _FINEST)
     columns = _columns(problem, axis, size)
     for name, column in columns.items():
         groups, index = np.unique(column, return_inverse=True)
         if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
-            yield Curves(f"along {name}", _smooth(column))
-            yield from _ripples(name, (column - column.min()) / np.ptp(column))
+            yield from _over(name, column, _FINEST)
         else:
             grouped = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
             yield Curves(f"by {name}", grouped, column=name)
@@ -156,7 +155,13 @@ def cycles(size: int, over: str) -> tuple[Curves, ...]:
     )
 
 
-def _ripples(over: str, place: np.ndarray, finest: int = _FINEST) -> Iterator[Curves]:
+def _over(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
+    """Smooth over a column (size,), and ripples over its values."""
+    yield Curves(f"along {name}", _smooth(column))
+    yield from _ripples(name, (column - column.min()) / np.ptp(column), finest)
+
+
+def _ripples(over: str, place: np.ndarray, finest: int) -> Iterator[Curves]:
     """Octaves of ripples over places (size,) in (0, 1)."""
     low, finest = _ORDER + 1, min(len(place) - 1, finest)
     while low <= finest:

@@ -72,10 +72,14 @@ def _grown(name: str, rate: Callable[[Parameters], Any] = lambda _: 1.0) -> Move
     return move
 
 
-def _gamma_respread(p: Parameters, step: jax.Array) -> Parameters:
-    """Another concentration at the same mean."""
-    factor = jnp.exp(step / (p["concentration"] * residuals.gamma_spread(p)))
-    return {**p, "concentration": p["concentration"] * factor, "rate": p["rate"] * factor}
+def _at_same_mean(spread: Callable[[Parameters], jax.Array]) -> Move:
+    """Another concentration, of which there is so much information, and the rate with it."""
+
+    def move(p: Parameters, step: jax.Array) -> Parameters:
+        factor = jnp.exp(step / (p["concentration"] * spread(p)))
+        return {**p, "concentration": p["concentration"] * factor, "rate": p["rate"] * factor}
+
+    return move
 
 
 def _weibull_respread(p: Parameters, step: jax.Array) -> Parameters:
@@ -101,12 +105,6 @@ def _beta_respread(p: Parameters, step: jax.Array) -> Parameters:
         "concentration1": p["concentration1"] * jnp.exp(change * second / p["concentration1"]),
         "concentration0": p["concentration0"] * jnp.exp(change * first / p["concentration0"]),
     }
-
-
-def _counts_respread(p: Parameters, step: jax.Array) -> Parameters:
-    """Another concentration of counts at the same mean."""
-    factor = jnp.exp(step / (p["concentration"] * discrete.counts_spread(p)))
-    return {**p, "concentration": p["concentration"] * factor, "rate": p["rate"] * factor}
 
 
 def _to_logits(p: Parameters, step: jax.Array) -> Parameters:
@@ -205,7 +203,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.gamma_shift,
         located=1,
         relocate=_grown("rate", lambda p: -(p["concentration"] ** -0.5)),
-        respread=_gamma_respread,
+        respread=_at_same_mean(residuals.gamma_spread),
     ),
     "Weibull": Likelihood(
         dist.Weibull,
@@ -243,7 +241,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.counts_shift,
         located=1,
         relocate=_grown("rate", lambda p: -discrete.counts_deviation(p) * p["rate"] / p["concentration"]),
-        respread=_counts_respread,
+        respread=_at_same_mean(discrete.counts_spread),
     ),
     "Poisson": Likelihood(
         dist.Poisson,

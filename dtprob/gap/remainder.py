@@ -88,7 +88,7 @@ def model_remainder(
         key: for the bootstrap over clusters.
     """
     problem = view.problem
-    named = {f"{_NAME}[{i}]": s for i, s in enumerate(shortlist(problem, view.location.suspects))}
+    named = _named(shortlist(problem, view.location.suspects))
     if not named:
         return None
     wider, fitted = _wider(view, named)
@@ -119,15 +119,16 @@ def alone(view: View) -> float:
     problem = view.problem
     shared = [s for s in view.location.suspects if not _is_per_cluster(problem, s)]
     apart = {(s.site, round(s.evidence, 3)): s for s in shared if _size(problem, s) <= _WEIGHTS}
-    named = {f"{_NAME}[{i}]": s for i, s in enumerate(list(apart.values())[:_TRIED])}
+    named = _named(list(apart.values())[:_TRIED])
     if not named:
         return -np.inf
     wider, fitted = _wider(view, named)
-    fits = (
-        fitting.fit(wider, fitted.x, (*fitted.effects, name), spread={**fitted.spread, name: 1.0})
-        for name in named
-    )
-    return max(one.log_evidence for one in fits)
+    return max(_fitted_with(wider, fitted, name).log_evidence for name in named)
+
+
+def _named(suspects: Sequence[Suspect]) -> dict[str, Suspect]:
+    """Families by the names that they have as effects."""
+    return {f"{_NAME}[{i}]": suspect for i, suspect in enumerate(suspects)}
 
 
 def _wider(view: View, named: Mapping[str, Suspect]) -> tuple[Problem, fitting.Fit]:
@@ -158,13 +159,18 @@ def _forward(problem: Problem, fitted: fitting.Fit, names: Sequence[str]) -> fit
     """The fit with those of the fields that raise the evidence, each beside the ones before it."""
     taken = 0
     for name in names:
-        spread = {**fitted.spread, name: 1.0}
-        trial = fitting.fit(problem, fitted.x, (*fitted.effects, name), spread=spread)
+        trial = _fitted_with(problem, fitted, name)
         if trial.log_evidence > fitted.log_evidence + _LEAST:
             fitted, taken = trial, taken + 1
         if taken == _TAKEN:
             break
     return fitted
+
+
+def _fitted_with(problem: Problem, fitted: fitting.Fit, name: str) -> fitting.Fit:
+    """The fit with one more field."""
+    spread = {**fitted.spread, name: 1.0}
+    return fitting.fit(problem, fitted.x, (*fitted.effects, name), spread=spread)
 
 
 def _term(problem: Problem, suspect: Suspect) -> Term:

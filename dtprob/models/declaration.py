@@ -30,6 +30,7 @@ type Data = Mapping[str, Any]
 type Kind = Literal["latent", "deterministic", "observed"]
 
 _METADATA = "__dtprob__"
+_UNNAMED = "_dim_"
 _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
@@ -274,6 +275,11 @@ def _inner(fn: Any) -> Any:
     return fn
 
 
+def is_unnamed(axis: str) -> bool:
+    """Whether an axis got its name from its site alone, since nothing in the model names it."""
+    return _UNNAMED in axis
+
+
 def _axes(
     name: str, shape: tuple[int, ...], frames: Sequence[Any], event_dim: int, notes: Metadata
 ) -> tuple[str, ...]:
@@ -287,7 +293,7 @@ def _axes(
                 "Name every dimension, first to last.",
             )
         return declared
-    axes = [f"{name}_dim_{i}" for i in range(len(shape))]
+    axes = [f"{name}{_UNNAMED}{i}" for i in range(len(shape))]
     for frame in frames:
         position = len(shape) - event_dim + frame.dim
         if 0 <= position < len(shape) and shape[position] == frame.size:

@@ -12,7 +12,7 @@ import numpyro
 
 from dtprob.inference.build import build_target
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Declaration, Model, declare, trace_model
+from dtprob.models.declaration import Declaration, Model, declare, is_unnamed, trace_model
 from dtprob.testing.contract import expect, same
 
 _POINTS = 8
@@ -47,7 +47,7 @@ def check_model(model: Model, data: Mapping[str, Any], *, key: jax.Array | None 
 
 def _check_axes(what: str, declaration: Declaration) -> None:
     for name, site in declaration.sites.items():
-        unnamed = [axis for axis in site.axes if axis.startswith(f"{name}_dim_")]
+        unnamed = [axis for axis in site.axes if is_unnamed(axis)]
         remedy = f"Use plates, or the decorator @model(axes={{{name!r}: (...)}})"
         expect(not unnamed, what, f"a name for every axis of {name!r}", f"{len(unnamed)} without", remedy)
 

@@ -56,10 +56,7 @@ def test_points_are_the_textbooks():
     assert np.all(np.abs(drawn.mean(axis=0) - mean) < error)
 
 
-def test_the_figure_in_small(tmp_path, monkeypatch):
-    """Its lines; what remembers and the rules of single devices are tested with their learners."""
-    monkeypatch.setattr(fig2, "remembering", lambda *_: np.ones(2))
-    monkeypatch.setattr(fig2, "local_rules", lambda *_: {"throughput": np.ones(3)})
+def test_the_figure_in_small(tmp_path):
     campaign = Campaign(COMA(), Budget(640, 8, 20), starts=0)
     with jax.enable_x64(False):  # as `run` does; one part asks for double precision
         found = fig2.figure(KEY, 2, Progress(folder=tmp_path / "parts"), (0, 4), campaign)

@@ -50,7 +50,7 @@ ENGINES = {
     "ensemble, normal": (Ensemble(members=DRAWS, starts=1), 120),
     "exact, normal": (Exact(draws=DRAWS), 120),
     "hmc, circular": (HMC(**SHORT), 60),
-    "exact, multi_access": (Exact(draws=DRAWS), 30),
+    "exact, multi_access": (Exact(draws=DRAWS), 60),
     "exact, prediction_powered": (Exact(draws=DRAWS), 60),
     "nuts, custom": (NUTS(**SHORT), 60),
     "blackjax_nuts, phase_error_channel": (BlackJAXNUTS(**SHORT), 30),

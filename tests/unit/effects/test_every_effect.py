@@ -218,8 +218,6 @@ def test_all_together_compile_and_compose(world, effects, base):
 
 
 def test_single_precision_stays_single(world, effects):
-    one_of_each = list({effect.family: effect for effect in effects.values()}.values())
-
     def single(x):
         kind = {np.dtype("float64"): np.float32, np.dtype("complex128"): np.complex64}
         return np.asarray(x).astype(kind.get(np.asarray(x).dtype, np.asarray(x).dtype))
@@ -227,11 +225,11 @@ def test_single_precision_stays_single(world, effects):
     with jax.enable_x64(False):
         data = jax.tree.map(single, world.data)
         draws = {}
-        for effect in one_of_each:
+        for effect in effects.values():
             for p in effect.parameters:
                 size = 1e-3 * float(np.max(np.sqrt(p.prior.variance)))
                 draws[f"{effect.name}.{p.name}"] = np.full(p.shape, size, np.float32)
-        extended = handlers.substitute(with_effects(world.model, one_of_each), data=draws)
+        extended = handlers.substitute(with_effects(world.model, list(effects.values())), data=draws)
         trace = handlers.trace(handlers.seed(extended, 0)).get_trace(**data)
         for name, message in trace.items():
             if message["type"] in ("deterministic", "sample"):

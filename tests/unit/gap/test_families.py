@@ -9,7 +9,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.gap.curves import curves, cycles, quantity
+from dtprob.gap.curves import Quantity, curves, cycles, quantity
 from dtprob.gap.families import deterministic, families, observed, shifted
 from dtprob.gap.problem import Problem
 from tests.unit.gap.examples import bend, draw, line
@@ -128,6 +128,9 @@ def test_a_quantity_lies_on_the_axes_along_which_it_varies():
     assert found.kept(("link", "antenna"), (LENGTH, 3)) is None
     unnamed = quantity("level", ("level_dim_0",), np.arange(9.0))
     assert unnamed.kept(("power_dim_0",), (9,)) == (0,)
+    square = Quantity("phase", ("receiver", "transmitter"), np.ones((4, 4)))
+    assert square.kept(("transmitter", "receiver"), (4, 4)) is None  # as many, but others
+    assert square.kept(("receiver", "power_dim_1"), (4, 4)) == (0, 1)
     assert quantity("device", ("link",), np.arange(9)) is None
     assert quantity("height", ("link",), np.array([1.5, 10.0] * 9)) is None
     assert quantity("gain", ("link",), np.full(9, np.nan)) is None

@@ -75,6 +75,9 @@ def test_the_error_is_the_root_mean_square():
 WRONG = {
     "regional_bias[x2_high]": lambda truth, x, _: truth - 0.5 * (x[:, 2] > 1 / 3),
     "scale_bias": lambda truth, _x, _rng: 0.6 * truth + 0.3,  # right at another level than the mean one
+    "stale_map": lambda truth, x, rng: (
+        truth + 0.5 * rng.normal(size=(4, 4))[tuple(np.floor(2 * x[:, :2] + 2).astype(int).T)]
+    ),
 }
 
 
