@@ -33,15 +33,15 @@ import numpyro.distributions as dist  # noqa: E402
 from record import record, recorded  # noqa: E402
 
 from dtprob.effects.effect import Effect, Parameter  # noqa: E402
-from dtprob.gap.base import fit_base  # noqa: E402
-from dtprob.gap.bootstrap import replicate  # noqa: E402
 from dtprob.gap.diagnose import diagnose  # noqa: E402
-from dtprob.gap.directions import surroundings, tangents  # noqa: E402
-from dtprob.gap.problem import Problem  # noqa: E402
-from dtprob.gap.projection import project  # noqa: E402
-from dtprob.gap.screen import screen  # noqa: E402
+from dtprob.gap.fitting.base import fit_base  # noqa: E402
+from dtprob.gap.fitting.bootstrap import replicate  # noqa: E402
+from dtprob.gap.fitting.projection import project  # noqa: E402
+from dtprob.gap.model.problem import Problem  # noqa: E402
 from dtprob.gap.settings import Settings  # noqa: E402
-from dtprob.gap.where import locate  # noqa: E402
+from dtprob.gap.where.locate import locate  # noqa: E402
+from dtprob.gap.which.directions import surroundings, tangents  # noqa: E402
+from dtprob.gap.which.screen import screen  # noqa: E402
 from dtprob.inference import Laplace  # noqa: E402
 from dtprob.models.complex_normal import ComplexNormal  # noqa: E402
 from dtprob.models.declaration import model  # noqa: E402

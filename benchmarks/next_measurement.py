@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float
 from record import record
 
-from dtprob.gap.design import Design, Prediction, joined, rank, recommend
+from dtprob.gap.next_measurement.design import Design, Prediction, joined, rank, recommend
 
 STREETS, ROWS = 24, 12
 STREET_DB, ERROR_DB = 2.0, 3.0

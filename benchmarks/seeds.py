@@ -20,7 +20,7 @@ from record import record
 from dtprob.case import load_case
 from dtprob.commands.diagnose import answer
 from dtprob.commands.run import configure
-from dtprob.gap.rates import Rate
+from dtprob.gap.withheld.rates import Rate
 
 
 def main() -> None:

@@ -16,9 +16,9 @@ from typing import Any
 
 from record import record
 
-from dtprob.gap.answers import Answer
-from dtprob.gap.score import score
-from dtprob.gap.targets import against_targets
+from dtprob.gap.withheld.answers import Answer
+from dtprob.gap.withheld.score import score
+from dtprob.gap.withheld.targets import against_targets
 
 
 def main() -> None:

@@ -15,9 +15,9 @@ from dtprob.case import Case
 from dtprob.commands.run import Run, chosen, infer, prepare_case, session
 from dtprob.files import atomic_write, write_text
 from dtprob.gap.diagnose import diagnose
-from dtprob.gap.problem import Problem
-from dtprob.gap.rivals.compete import compete
+from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
+from dtprob.gap.withheld.rivals.compete import compete
 from dtprob.inference import Posterior
 from dtprob.report import render, to_json
 from dtprob.workflow import Prepared

@@ -120,7 +120,7 @@ def score(answers: Path, key: Path) -> None:
     Raises:
         InputError: no key, or answers that do not belong to it.
     """
-    from dtprob.gap.score import score as scored  # noqa: PLC0415  (heavy)
+    from dtprob.gap.withheld.score import score as scored  # noqa: PLC0415  (heavy)
     from dtprob.report.score_page import render_score  # noqa: PLC0415
 
     content = _json(key)

@@ -10,12 +10,12 @@ import jax
 import numpy as np
 import xarray as xr
 
-from dtprob.gap import closed
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
-from dtprob.gap.screen import Screening
+from dtprob.gap.how_far import closed
 from dtprob.gap.settings import Settings
-from dtprob.gap.where import SiteFinding
+from dtprob.gap.where.locate import SiteFinding
+from dtprob.gap.which.screen import Screening
 from dtprob.inference.engine import AbstractEngine
 
 _DRAWS = 200

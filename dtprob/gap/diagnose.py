@@ -11,20 +11,20 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.errors import InputError
-from dtprob.gap import closed
 from dtprob.gap.compose import compose
-from dtprob.gap.confirm import confirm
-from dtprob.gap.design_data import next_measurement
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
-from dtprob.gap.integrated import based
-from dtprob.gap.problem import Problem
-from dtprob.gap.remainder import model_remainder
-from dtprob.gap.search import search
+from dtprob.gap.fitting.integrated import based
+from dtprob.gap.fitting.soundness import idle, notes
+from dtprob.gap.how_far import closed
+from dtprob.gap.how_far.remainder import model_remainder
+from dtprob.gap.how_far.shares import shares
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
-from dtprob.gap.shares import shares
-from dtprob.gap.soundness import idle, notes
-from dtprob.gap.trials import Say, credit
+from dtprob.gap.which.confirm import confirm
+from dtprob.gap.which.search import search
+from dtprob.gap.which.trials import Say, credit
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.declaration import Data, Model

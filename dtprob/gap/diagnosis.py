@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
-from dtprob.gap.closed import ClosedFraction
-from dtprob.gap.shares import Share
+from dtprob.gap.how_far.closed import ClosedFraction
+from dtprob.gap.how_far.shares import Share
 
 
 @dataclass(frozen=True)

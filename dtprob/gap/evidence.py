@@ -4,15 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from dtprob.gap.closed import ClosedFraction, Floor, HeldOut
-from dtprob.gap.fit import Fit
-from dtprob.gap.problem import Problem
-from dtprob.gap.remainder import Remainder
-from dtprob.gap.search import Step
-from dtprob.gap.shares import Share
-from dtprob.gap.trials import Start
+from dtprob.gap.fitting.fit import Fit
+from dtprob.gap.how_far.closed import ClosedFraction, Floor, HeldOut
+from dtprob.gap.how_far.remainder import Remainder
+from dtprob.gap.how_far.shares import Share
+from dtprob.gap.model.problem import Problem
 from dtprob.gap.view import View
-from dtprob.gap.where import Location
+from dtprob.gap.where.locate import Location
+from dtprob.gap.which.search import Step
+from dtprob.gap.which.trials import Start
 
 
 @dataclass(frozen=True)

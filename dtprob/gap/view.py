@@ -6,13 +6,13 @@ from dataclasses import dataclass
 
 import jax
 
-from dtprob.gap import fit as fitting
-from dtprob.gap.bootstrap import replicate
-from dtprob.gap.problem import Problem
-from dtprob.gap.projection import Projection, project
-from dtprob.gap.screen import Screening, screen
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.bootstrap import replicate
+from dtprob.gap.fitting.projection import Projection, project
+from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.where import Location, locate
+from dtprob.gap.where.locate import Location, locate
+from dtprob.gap.which.screen import Screening, screen
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,7 @@ def render_score(score: Mapping[str, Any]) -> str:
     """The page of a score, as self-contained HTML.
 
     Args:
-        score: the content of score.json, from `dtprob.gap.score`.
+        score: the content of score.json, from `dtprob.gap.withheld.score`.
 
     Returns:
         the text of an HTML file: no script, no request.

@@ -15,12 +15,12 @@ import pytest
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap import diagnose as diagnosing
-from dtprob.gap import integrated
-from dtprob.gap.confirm import confirm
 from dtprob.gap.diagnose import diagnose
-from dtprob.gap.fit import fit
-from dtprob.gap.problem import Problem
+from dtprob.gap.fitting import integrated
+from dtprob.gap.fitting.fit import fit
+from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
+from dtprob.gap.which.confirm import confirm
 from dtprob.inference import NUTS, Laplace
 from dtprob.models.declaration import model, split_static
 from tests.unit.gap.examples import (

@@ -6,16 +6,16 @@ import pytest
 from scipy import stats
 from scipy.special import logsumexp
 
-from dtprob.gap import fit as fitting
-from dtprob.gap.bootstrap import more, replicate
-from dtprob.gap.plausible import SCALES
-from dtprob.gap.problem import Problem
-from dtprob.gap.projection import project
-from dtprob.gap.screen import screen
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.bootstrap import more, replicate
+from dtprob.gap.fitting.plausible import SCALES
+from dtprob.gap.fitting.projection import project
+from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise, gamma_tail
 from dtprob.gap.view import view
-from dtprob.gap.where import locate
+from dtprob.gap.where.locate import locate
+from dtprob.gap.which.screen import screen
 from dtprob.models.declaration import split_static
 from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation
 

@@ -10,10 +10,10 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.effects import Effect, Parameter
-from dtprob.gap.base import fit_base
-from dtprob.gap.problem import Problem
-from dtprob.gap.search import search
+from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
+from dtprob.gap.which.search import search
 
 LENGTH = 480
 SETTINGS = Settings(replicates=200, candidates=3)

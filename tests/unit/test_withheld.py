@@ -8,7 +8,7 @@ import pytest
 
 from dtprob.cli import main
 from dtprob.commands import withheld
-from dtprob.gap.rivals.compete import RIVALS
+from dtprob.gap.withheld.rivals.compete import RIVALS
 from tests.unit.test_cli import CASE, EFFECTS, MODEL
 
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from dtprob.effects import catalogue
 from dtprob.gap.diagnose import diagnose
-from dtprob.gap.trials import Say
+from dtprob.gap.which.trials import Say
 from dtprob.inference import LATENTS_ONLY, Exact, Laplace
 from dtprob.models.declaration import declare
 from dtprob.models.multi_access import multi_access, records

@@ -5,11 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dtprob.gap.closed import ClosedFraction
 from dtprob.gap.diagnose import decide
 from dtprob.gap.evidence import Evidence
+from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.settings import Settings
-from dtprob.gap.trials import Start, best, credit
+from dtprob.gap.which.trials import Start, best, credit
 
 
 def evidence(kind, p_after):

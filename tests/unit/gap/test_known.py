@@ -11,8 +11,8 @@ import pytest
 
 from dtprob.effects import Effect, Parameter, with_effects
 from dtprob.effects.effect import effects_of
-from dtprob.gap.base import fit_base
-from dtprob.gap.problem import Problem
+from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import model
 
 WAVES = np.linspace(20.0, 40.0, 24)

@@ -1,0 +1,1 @@
+"""Posterior modes, what they leave of the data, and data sets drawn at them."""

@@ -1,0 +1,109 @@
+"""Which coordinates a fit moves, and the priors of effects that join the base model's."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Final
+
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects.effect import Effect
+from dtprob.gap.fitting.plausible import prior_scale, scales
+from dtprob.gap.model.layout import Block
+from dtprob.gap.model.problem import Problem
+
+LOG_2PI: Final = float(np.log(2 * np.pi))
+_FAINT: Final = 0.1
+
+
+@dataclass(frozen=True)
+class Active:
+    """Which coordinates a fit moves, and the priors that are not the base model's."""
+
+    blocks: tuple[Block, ...]
+    effects: tuple[Effect, ...]
+    weights: np.ndarray
+    spread: dict[str, float]
+
+    @property
+    def global_index(self) -> np.ndarray:
+        """Positions of the global coordinates."""
+        parts = [b.index[0] for b in self.blocks if not b.local]
+        return np.concatenate(parts) if parts else np.zeros(0, int)
+
+    @property
+    def base_index(self) -> np.ndarray:
+        """Positions of those of them that are the base model's."""
+        parts = [b.index[0] for b in self.blocks if not b.local and b.owner is None]
+        return np.concatenate(parts) if parts else np.zeros(0, int)
+
+    @property
+    def local_index(self) -> np.ndarray:
+        """Positions of the local coordinates, (cluster, local)."""
+        parts = [b.index for b in self.blocks if b.local]
+        return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.weights), 0), int)
+
+
+def activate(
+    problem: Problem,
+    effects: Sequence[str] = (),
+    weights: np.ndarray | None = None,
+    spread: Mapping[str, float] = MappingProxyType({}),
+) -> Active:
+    """The base model's nuisances and the named effects.
+
+    Args:
+        problem: in which the effects are live.
+        effects: their names.
+        weights: per cluster, one by default.
+        spread: standard deviation of variance effects' fields by name; those not given get one to start from.
+    """
+    chosen = tuple(e for e in problem.live if e.name in effects)
+    blocks = [b for b in problem.layout.blocks if b.owner is None or b.owner in effects]
+    weights = np.ones(problem.n_cluster) if weights is None else weights
+    fields = [e for e in chosen if e.kind == "variance"]
+    return Active(
+        tuple(blocks), chosen, weights, {e.name: spread.get(e.name, _first_spread(e)) for e in fields}
+    )
+
+
+def _first_spread(effect: Effect) -> float:
+    """A tenth: in the field's own unit or, where that is more, of its largest plausible standard deviation."""
+    return _FAINT * max(1.0, float(scales(effect).max()))
+
+
+def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Log prior, its gradient and minus its curvature (diagonal) for the free effects' coordinates."""
+    total = 0.0
+    gradient, curvature = np.zeros(problem.dimension), np.zeros(problem.dimension)
+    for effect in active.effects:
+        if effect.kind == "variance":
+            sd = active.spread[effect.name]
+            for block in problem.blocks_of(effect.name):
+                w = x[block.index]
+                total += float(-0.5 * np.sum(w**2) / sd**2 - w.size * (np.log(sd) + 0.5 * LOG_2PI))
+                gradient[block.index] = -w / sd**2
+                curvature[block.index] = 1 / sd**2
+            continue
+        for parameter in effect.parameters:
+            block = problem.layout[effect.site_name(parameter.name)]
+            value = jnp.asarray(x[block.index[0]]).reshape(parameter.shape)
+            sd = np.asarray(prior_scale(parameter.prior)) * np.ones(parameter.shape)
+            inside = jnp.maximum(value, parameter.null + 1e-9 * sd) if parameter.is_one_sided else value
+            total += float(jnp.sum(parameter.prior.log_prob(inside)))  # the null may not count as support
+            gradient[block.index[0]] = -((np.asarray(value) - parameter.null) / sd**2).reshape(-1)
+            curvature[block.index[0]] = (1 / sd**2 * np.ones(parameter.shape)).reshape(-1)
+    return total, gradient, curvature
+
+
+def basis(problem: Problem, active: Active) -> np.ndarray:
+    """One direction per global coordinate, then one per local coordinate that moves it in all clusters at once."""
+    n_global, n_local = len(active.global_index), active.local_index.shape[1]
+    directions = np.zeros((n_global + n_local, problem.dimension))
+    directions[np.arange(n_global), active.global_index] = 1.0
+    for j in range(n_local):
+        directions[n_global + j, active.local_index[:, j]] = 1.0
+    return directions

@@ -1,0 +1,111 @@
+"""Data sets drawn at a fit, with which a diagnosis compares the data: drawn a portion at a time, as often as wanted."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.gap.fitting.fit import Fit
+from dtprob.gap.fitting.projection import Projection
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+
+_PORTION: Final = 50
+"""Replicates that are held at once."""
+_MOST_VALUES: Final = 2e7
+"""Values of sites that further replicates may hold together."""
+
+
+@dataclass(frozen=True)
+class Replicates:
+    """The data and data sets drawn at a fit, the nuisances refitted to first order, and what they say at the sites.
+
+    Attributes:
+        problem, fitted, projection: where they are drawn.
+        keys: one per replicate.
+        raw: rows of the data (cluster, row), as if nothing had been fitted.
+        observed: projected rows of the data (cluster, row).
+        projected: projected rows of the first replicates (replicate, cluster, row).
+        gradients: site gradients of the data and of the first replicates, (1 + replicate, *site) by site.
+    """
+
+    problem: Problem
+    fitted: Fit
+    projection: Projection
+    keys: jax.Array
+    raw: np.ndarray
+    observed: np.ndarray
+    projected: np.ndarray
+    gradients: Mapping[str, jax.Array]
+
+    def portions(self) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
+        """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
+        return _portions(self.problem, self.fitted, self.projection, self.keys)
+
+
+def replicate(
+    problem: Problem, fitted: Fit, projection: Projection, key: jax.Array, settings: Settings
+) -> Replicates:
+    """The bootstrap that the screening and the maps share.
+
+    Args:
+        problem: the model on its data.
+        fitted: where to draw.
+        projection: at the fit.
+        key: of the draws.
+        settings: how many replicates there are, and how many of them are taken to the sites.
+    """
+    keys = jax.random.split(key, settings.replicates)
+    raw = projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)))
+    observed = projection.rows(raw[None])[0]
+    projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
+    gradients = problem.compiled.site_gradient(fitted.x, np.concatenate([observed[None], projected]))
+    return Replicates(problem, fitted, projection, keys, raw, observed, projected, gradients)
+
+
+def more(drawn: Replicates, times: int) -> Replicates | None:
+    """As many times more replicates at the sites, all of them new; fewer where the sites are large, None where too large.
+
+    Args:
+        drawn: a first look at the same fit.
+        times: how many more.
+    """
+    first = len(drawn.projected)
+    entries = sum(g[0].size for g in drawn.gradients.values())
+    times = int(min(_MOST_VALUES / (first * max(entries, 1)), times))
+    if times < 2:
+        return None
+    keys = jax.random.split(jax.random.fold_in(drawn.keys[0], times), times * first)
+    projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
+    gradient = drawn.problem.compiled.site_gradient
+    parts = [
+        gradient(drawn.fitted.x, np.concatenate([drawn.observed[None], projected[low : low + first]]))
+        for low in range(0, len(projected), first)  # of the shape that is compiled
+    ]
+    gradients = {
+        n: jnp.asarray(np.concatenate([np.asarray(g)[:1], *(np.asarray(part[n])[1:] for part in parts)]))
+        for n, g in drawn.gradients.items()
+    }
+    return replace(drawn, projected=projected, gradients=gradients)
+
+
+def _projected(problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array) -> np.ndarray:
+    parts = _portions(problem, fitted, projection, keys)
+    return np.concatenate([projection.rows(rows) for rows, _ in parts])
+
+
+def _portions(
+    problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array
+) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
+    """Portions of one size are drawn, so that one program serves all; of the last one as much as there are keys."""
+    place = np.arange(-(-len(keys) // _PORTION) * _PORTION).reshape(-1, _PORTION)
+    for part in place:
+        own = keys[np.minimum(part, len(keys) - 1)]
+        rows, values = problem.compiled.replicate(fitted.x, own)
+        count = int((part < len(keys)).sum())
+        yield projection.with_prior(np.asarray(rows), own)[:count], {n: v[:count] for n, v in values.items()}

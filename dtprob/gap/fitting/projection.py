@@ -1,0 +1,214 @@
+"""What is left of data and of candidates once a fit has moved everything that it is free to move, to first order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Final, NamedTuple
+
+import jax
+import numpy as np
+
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.active import activate, basis, effect_prior
+from dtprob.gap.fitting.newton import positive
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.model.quick import quick_jit
+
+_FAINT: Final = 1e-3
+"""Share of the data's information on a coordinate below which its prior's is not looked at."""
+_TOGETHER: Final = 32
+"""Clusters whose projected columns are held at once."""
+_FEWEST_DRAWN: Final = 64
+"""Numbers of a replicate that are drawn at least."""
+_ROUNDING: Final = 1e-9
+"""What is left of a coordinate after its fit is taken back, as a share of the fit, is zero below this."""
+
+
+class Known(NamedTuple):
+    """What the prior knows of some coordinates.
+
+    Attributes:
+        deviation: of the fit from the prior's centre; 0 where the prior knows nothing.
+        spread: standard deviation of the prior; 0 where it knows nothing.
+    """
+
+    deviation: np.ndarray
+    spread: np.ndarray
+
+
+@dataclass(frozen=True)
+class Projection:
+    """Whitened tangents of everything that a fit moved, and what removes them from rows and from columns.
+
+    Attributes:
+        columns: tangents of the global coordinates (cluster, row, global).
+        local_columns: tangents of the local ones (cluster, row, local).
+        local_inverse: inverse curvature of the local ones (cluster, local, local).
+        global_inverse: inverse curvature of the global ones, the local ones eliminated.
+        reduced: tangents of the global ones after that elimination.
+        shared: what the prior knows of the global coordinates.
+        own: what it knows of the local ones.
+        origin: the flat vector of the fit, with what the prior knows at its centre.
+    """
+
+    columns: np.ndarray
+    local_columns: np.ndarray
+    local_inverse: np.ndarray
+    global_inverse: np.ndarray
+    reduced: np.ndarray
+    shared: Known
+    own: Known
+    origin: np.ndarray
+
+    def before_fit(self, residual: np.ndarray) -> np.ndarray:
+        """Rows (cluster, row) with all coordinates back at the centre of their prior, to first order.
+
+        A mode is drawn towards its prior, so that its residuals are not those of data whose coordinates were drawn from it:
+        only after this are data and replicates alike.
+        """
+        return residual + self.columns @ self.shared.deviation + _each(self.local_columns, self.own.deviation)
+
+    def with_prior(self, rows: np.ndarray, keys: jax.Array) -> np.ndarray:
+        """Rows (replicate, cluster, row) to which the prior's spread of all coordinates is added, by replicates' keys."""
+        shared, own = (
+            _normal(keys, which, part.spread.shape) * part.spread
+            for which, part in enumerate((self.shared, self.own))
+        )
+        return rows + _all(self.columns, shared) + _each(self.local_columns, own)
+
+    def rows(self, e: np.ndarray) -> np.ndarray:
+        """Rows (..., cluster, row) after the linearised refit of all nuisances."""
+        e = e - _all(self.columns, _scores(self.reduced, e) @ self.global_inverse.T)
+        return e - self._moved_alone(e)
+
+    def adjust(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Effect columns (cluster, row, k) after projection, and B's part that falls on the global nuisances."""
+        w = self._without_local(w, slice(None))
+        coefficients = self.global_inverse @ _product(self.reduced, w)
+        return w - self.reduced @ coefficients, coefficients
+
+    def information(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """W' P W and B's part that falls on the global nuisances, of effect columns W (cluster, row, k).
+
+        P W, the columns after projection, are made of a few clusters at a time.
+        """
+        parts = [slice(low, low + _TOGETHER) for low in range(0, len(w), _TOGETHER)]
+        cross = sum((_product(self.reduced[c], self._without_local(w[c], c)) for c in parts), np.zeros(()))
+        coefficients = self.global_inverse @ cross
+        found = np.zeros((w.shape[-1], w.shape[-1]))
+        for c in parts:
+            adjusted = self._without_local(w[c], c) - self.reduced[c] @ coefficients
+            found += _product(w[c], adjusted)
+        return found, coefficients
+
+    def _without_local(self, w: np.ndarray, clusters: slice) -> np.ndarray:
+        """Columns (cluster, row, k) of some clusters, their local coordinates projected away."""
+        own = self.local_columns[clusters]
+        if not own.shape[-1]:
+            return w
+        return w - own @ (self.local_inverse[clusters] @ (np.swapaxes(own, 1, 2) @ w))
+
+    def adjoint(self, e: np.ndarray) -> np.ndarray:
+        """Rows P' e (..., cluster, row), whose products with columns W are those of e with P W."""
+        e = e - _all(self.reduced, _scores(self.reduced, e) @ self.global_inverse.T)
+        return e - self._moved_alone(e)
+
+    def _moved_alone(self, e: np.ndarray) -> np.ndarray:
+        """What a refit of the local coordinates alone moves of rows (..., cluster, row)."""
+        own = self.local_columns
+        score = _apart(e) @ own @ np.swapaxes(self.local_inverse, 1, 2)
+        return np.moveaxis(score @ np.swapaxes(own, 1, 2), 0, -2).reshape(e.shape)
+
+
+def _scores(columns: np.ndarray, e: np.ndarray) -> np.ndarray:
+    """Products (..., i) of columns (cluster, row, i) with rows (..., cluster, row)."""
+    entries = columns.shape[0] * columns.shape[1]
+    return e.reshape(*e.shape[:-2], entries) @ columns.reshape(entries, columns.shape[-1])
+
+
+def _all(columns: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Rows (..., cluster, row) that steps (..., i) of columns (cluster, row, i) make."""
+    entries = columns.shape[0] * columns.shape[1]
+    moved = steps @ columns.reshape(entries, columns.shape[-1]).T
+    return moved.reshape(*steps.shape[:-1], *columns.shape[:-1])
+
+
+def _each(columns: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Rows (..., cluster, row) that steps (..., cluster, i) of columns (cluster, row, i) make, cluster by cluster."""
+    moved = np.moveaxis(_apart(steps) @ np.swapaxes(columns, 1, 2), 0, -2)
+    return moved.reshape(*steps.shape[:-1], columns.shape[1])
+
+
+def _apart(values: np.ndarray) -> np.ndarray:
+    """Values (..., cluster, i) as (cluster, n, i)."""
+    n = int(np.prod(values.shape[:-2], dtype=int))
+    return np.moveaxis(values, -2, 0).reshape(values.shape[-2], n, values.shape[-1])
+
+
+@partial(quick_jit, static_argnames="size")
+def _standard_normal(keys: jax.Array, which: int, size: int) -> jax.Array:
+    return jax.vmap(lambda key: jax.random.normal(jax.random.fold_in(key, which), (size,)))(keys)
+
+
+def _normal(keys: jax.Array, which: int, shape: tuple[int, ...]) -> np.ndarray:
+    """Standard normal numbers (key, *shape); drawn in powers of two, so that few programs serve all shapes."""
+    count = int(np.prod(shape, dtype=int))
+    if not count:
+        return np.zeros((len(keys), *shape))
+    size = max(_FEWEST_DRAWN, 1 << max(count - 1, 0).bit_length())
+    return np.asarray(_standard_normal(keys, which, size))[:, :count].reshape(-1, *shape)
+
+
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Sum over clusters and rows of columns (cluster, row, i) times columns (cluster, row, j)."""
+    entries = left.shape[0] * left.shape[1]
+    return left.reshape(entries, left.shape[-1]).T @ right.reshape(entries, right.shape[-1])
+
+
+def project(problem: Problem, fitted: fitting.Fit) -> Projection:
+    """Projection on the complement of everything that the fit is free to move."""
+    active = activate(problem, fitted.effects, spread=fitted.spread)
+    directions = basis(problem, active)
+    n = len(active.global_index)
+    w = np.asarray(problem.compiled.linearised(fitted.x, directions)[1])
+    prior_slope, hessian = problem.compiled.prior(fitted.x, directions)
+    _, effect_slope, effect_curvature = effect_prior(problem, active, fitted.x)
+    w_global, w_local = np.ascontiguousarray(w[..., :n]), np.ascontiguousarray(w[..., n:])
+    slope = prior_slope + effect_slope
+    flat = np.zeros(problem.dimension)
+    flat[active.global_index] = np.diag(hessian[:n][:, active.global_index])
+    flat[active.local_index] = np.einsum("jcj->cj", hessian[n:][:, active.local_index])
+    flat = flat + effect_curvature
+    information = np.einsum("cmg,cmg->g", w_global, w_global), np.einsum("cml,cml->cl", w_local, w_local)
+    shared, own = (
+        _known(slope[index], flat[index], part)
+        for index, part in zip((active.global_index, active.local_index), information, strict=True)
+    )
+    if problem.volume is not None:  # what a coordinate does through the clusters' own is spread, not a shift
+        centre = fitted.x.copy()
+        centre[active.local_index] -= own.deviation
+        w_global = np.asarray(problem.compiled.linearised(centre, directions[:n])[1])
+    transposed = np.swapaxes(w_local, 1, 2)
+    local = transposed @ w_local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
+    for j in range(active.local_index.shape[1]):
+        local[:, j, j] += effect_curvature[active.local_index[:, j]]
+    local_inverse = np.linalg.inv(positive(local)) if local.shape[-1] else local
+    reduced = w_global - w_local @ (local_inverse @ (transposed @ w_global))
+    curvature = _product(w_global, reduced)
+    curvature = (
+        curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
+    )
+    inverse = np.linalg.inv(positive(curvature)) if n else curvature
+    origin = fitted.x.copy()
+    origin[active.global_index] -= shared.deviation
+    origin[active.local_index] -= own.deviation
+    origin = np.where(np.abs(origin) < _ROUNDING * np.abs(fitted.x), 0.0, origin)
+    return Projection(w_global, w_local, local_inverse, inverse, reduced, shared, own, origin)
+
+
+def _known(slope: np.ndarray, precision: np.ndarray, information: np.ndarray) -> Known:
+    """From slope and precision of a log prior; what the data know far better counts as not known before."""
+    informative = precision > _FAINT * information
+    safe = np.where(informative, precision, 1.0)
+    return Known(np.where(informative, -slope / safe, 0.0), np.where(informative, safe**-0.5, 0.0))

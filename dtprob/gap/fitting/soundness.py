@@ -1,0 +1,127 @@
+"""What is wrong with a base model or its data before any effect is tried."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+
+from dtprob.errors import InputError
+from dtprob.gap.fitting.active import activate
+from dtprob.gap.fitting.fit import Fit
+from dtprob.gap.fitting.projection import project
+from dtprob.gap.model.problem import Problem
+
+UNSEEN: Final = "nothing observed depends on it"
+"""What hides an effect that does nothing."""
+_MISFIT: Final = 30.0
+"""Residuals as many times the spread that the model allows are no fit."""
+_SINGULAR: Final = 1e-8
+"""Information along a direction, as a share of that of its parameters alone, below which data do not determine it."""
+_TAKES_PART: Final = 0.2
+"""Weight of a parameter in a direction from which on it is named."""
+_SHOWN: Final = 4
+
+
+def broken(problem: Problem, starts: Sequence[np.ndarray]) -> InputError:
+    """Why a model has no finite likelihood: the first thing that is not finite, data before sites before observations.
+
+    Args:
+        problem: the model on its data.
+        starts: flat vectors that were tried.
+    """
+    what = f"base model {problem.declaration.name}"
+    for name, site in problem.declaration.observed.items():
+        bad = ~np.isfinite(np.asarray(problem.observed_values[name]))
+        if bad.any():
+            argument = site.argument or name
+            return InputError(
+                f"data {argument}",
+                "finite values",
+                _counted(bad),
+                "Remove these rows or mark them as missing",
+            )
+    values: Mapping[str, Any] = problem.compiled.sites(starts[0])
+    for name in problem.declaration.deterministic:
+        bad = ~np.isfinite(np.asarray(values[name]))
+        if bad.any():
+            return InputError(
+                f"{what}, site {name}",
+                "finite values at the centre of the prior",
+                _counted(bad),
+                "Check the units of the data and the priors of what enters this site",
+            )
+    return InputError(
+        what,
+        "a finite likelihood somewhere under its prior",
+        f"none from any of {len(starts)} starts, though all its sites are finite",
+        f"Check that {', '.join(problem.declaration.observed)} can take the values of the data, in the same units",
+    )
+
+
+def _counted(bad: np.ndarray) -> str:
+    first = ", ".join(str(int(k)) for k in np.argwhere(bad)[0])
+    return f"{int(bad.sum())} of {bad.size} that are not, the first at [{first}]"
+
+
+def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
+    """What a reader should know of the fit of the base model, one sentence each; nothing where all is well."""
+    found = [] if fitted.converged else ["the fit of the base model had not converged"]
+    return (*found, *_misfit(problem, fitted), *_undetermined(problem, fitted))
+
+
+def idle(absorbed_by: Sequence[str | None]) -> list[str]:
+    """A note where no candidate does anything, from what hides each of them."""
+    is_idle = bool(absorbed_by) and set(absorbed_by) == {UNSEEN}
+    return ["nothing observed depends on any of the effects"] if is_idle else []
+
+
+def _misfit(problem: Problem, fitted: Fit) -> list[str]:
+    residual = np.asarray(problem.compiled.residual(fitted.x))
+    located = problem.rows.by_cluster(problem.rows.located) == 1
+    size = float(np.sqrt(np.mean(residual[located] ** 2))) if located.any() else 0.0
+    if size < _MISFIT:
+        return []
+    names = ", ".join(problem.declaration.observed)
+    left = f"what it leaves of {names} is {size:.2g} times the spread that it allows"
+    remedy = "check the units of the data and the prior of the noise before believing any cause"
+    return [f"the base model does not fit at all: {left}; {remedy}"]
+
+
+def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
+    """Parameters that the data do not determine: too few clusters, no information, or only a combination of them."""
+    blocks = [b for b in activate(problem, fitted.effects).blocks if not b.local]
+    owners = [b.name if b.size == 1 else f"{b.name}[{j}]" for b in blocks for j in range(b.size)]
+    if not owners:
+        return []
+    found = []
+    if problem.n_cluster < len(owners):
+        found.append(
+            f"{problem.n_cluster} clusters for {len(owners)} fitted parameters: what is held out tells little of how far"
+            " a cause closes the gap"
+        )
+    projection = project(problem.with_volume(None), fitted)  # what acts through the clusters' own is seen too
+    columns, reduced = projection.columns, projection.reduced
+    total = np.einsum("cmi,cmi->i", columns, columns)
+    seen = total > 0
+    if not seen.all():
+        found.append(
+            f"the data tell nothing about {_listed([o for o, s in zip(owners, seen, strict=True) if not s])}"
+        )
+    information = np.einsum("cmi,cmj->ij", columns, reduced)[np.ix_(seen, seen)]
+    size = np.sqrt(total[seen])
+    values, vectors = np.linalg.eigh((information + information.T) / 2 / np.outer(size, size))
+    known = [owner for owner, s in zip(owners, seen, strict=True) if s]
+    weak = np.abs(vectors[:, values < _SINGULAR]).max(axis=1, initial=0.0)
+    absorbed = [owner for owner, weight in zip(known, weak, strict=True) if weight > _TAKES_PART]
+    if absorbed:
+        found.append(
+            f"the data determine only a combination of {_listed(absorbed)}; their priors tell the rest"
+        )
+    return found
+
+
+def _listed(names: Sequence[str]) -> str:
+    more = f" and {len(names) - _SHOWN} more" if len(names) > _SHOWN else ""
+    return ", ".join(names[:_SHOWN]) + more

@@ -1,0 +1,103 @@
+"""Cluster-local coordinates out of wrong basins: angles, and what is found only together with an angle.
+
+A delay turns a narrow-band signal, so a link's delay and phase have many optima that neither leaves alone. Clusters are
+independent given the shared coordinates: one set of trials serves all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dtprob.gap.model.problem import Problem
+
+type Terms = Callable[[np.ndarray], np.ndarray]
+"""The flat vector -> what each cluster adds to the log posterior (cluster,)."""
+
+_ANGLES: Final = 8
+_ROUNDS: Final = 2
+_PLACES: Final = 13
+_REACH: Final = 3.0
+_MOST: Final = 4
+"""Pairs of an angle and another coordinate up to which they are looked for together."""
+
+
+class _Local(NamedTuple):
+    """Positions of the base model's cluster-local coordinates, (cluster,) each, and of what blocks they are part."""
+
+    name: str
+    positions: Int[np.ndarray, " cluster"]
+    is_angle: bool
+
+
+def swept(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) -> np.ndarray:
+    """The point with angles, and few other coordinates beside them, where each cluster is best over their whole range.
+
+    Args:
+        problem: the model on its data.
+        x: flat vector; shared coordinates stay.
+        terms: of the log posterior.
+    """
+    found = _locals(problem)
+    turns = [one for one in found if one.is_angle]
+    others = [one for one in found if not one.is_angle]
+    if not others or len(turns) * len(others) > _MOST:
+        return x
+    x, value = x.copy(), np.nan_to_num(terms(x), nan=-np.inf)
+    for turn in turns:
+        for other in others:
+            start = x.copy()
+            for place in _places(problem, other.name):
+                for angle in _circle():
+                    moved = start.copy()
+                    moved[other.positions], moved[turn.positions] = place, start[turn.positions] + angle
+                    value = _kept(x, value, moved, terms(moved), (turn, other))
+    return x
+
+
+def turned(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) -> np.ndarray:
+    """The point with angles where each cluster is best, found one after another.
+
+    Args:
+        problem: the model on its data.
+        x: flat vector; all that is no cluster-local angle stays.
+        terms: of the log posterior.
+    """
+    x = x.copy()
+    for _ in range(_ROUNDS):
+        for turn in (one for one in _locals(problem) if one.is_angle):
+            start, value = x.copy(), np.full(problem.n_cluster, -np.inf)
+            for angle in _circle():
+                moved = start.copy()
+                moved[turn.positions] += angle
+                value = _kept(x, value, moved, terms(moved), (turn,))
+    return x
+
+
+def _kept(
+    x: np.ndarray, value: np.ndarray, moved: np.ndarray, new: np.ndarray, coordinates: tuple[_Local, ...]
+) -> np.ndarray:
+    """Terms after clusters that are better at a trial have taken its coordinates."""
+    better = new > value
+    for one in coordinates:
+        x[one.positions[better]] = moved[one.positions[better]]
+    return np.where(better, new, value)
+
+
+def _locals(problem: Problem) -> list[_Local]:
+    circular = {name for name, site in problem.declaration.latent.items() if site.is_circular}
+    blocks = [block for block in problem.blocks_of(None) if block.local]
+    return [_Local(b.name, b.index[:, j], b.name in circular) for b in blocks for j in range(b.size)]
+
+
+def _places(problem: Problem, name: str) -> np.ndarray:
+    """Where a coordinate may be, by its prior."""
+    centre, scale = problem.usual[name]
+    return centre + scale * np.linspace(-_REACH, _REACH, _PLACES)
+
+
+def _circle() -> np.ndarray:
+    return np.linspace(-np.pi, np.pi, _ANGLES, endpoint=False)

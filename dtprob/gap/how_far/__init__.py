@@ -1,0 +1,1 @@
+"""How far a cause closes the gap, whose share is whose, and the rest modelled at its site."""

@@ -1,0 +1,329 @@
+"""What a diagnosis asks of a model on data, each compiled when first asked."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import cached_property, partial
+from typing import Any, Final, NamedTuple, final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.gap.model.quick import quick_jit
+from dtprob.gap.model.rows import stacked
+from dtprob.gap.model.running import Arrays, Outcome, Runner
+from dtprob.gap.observation import whiten
+
+CHUNK: Final = 16
+"""Directions or perturbations that go through a compiled program at a time."""
+_POINTS: Final = 64
+"""Points that are evaluated in one run, at most."""
+_DECIBELS = 10.0 / np.log(10.0)
+
+
+@final
+class Compiled:
+    """Compiled functions of a flat vector.
+
+    Args:
+        runner: the model.
+        arrays: its arguments that are arrays, and what is known of nuisances.
+        float_sites: deterministic sites that may be moved, in the largest shape that a candidate gives them.
+    """
+
+    def __init__(
+        self, runner: Runner, arrays: Arrays, float_sites: Mapping[str, jax.ShapeDtypeStruct]
+    ) -> None:
+        self._runner, self.arrays, self._float_sites = runner, arrays, float_sites
+
+    def terms(self, x: Any, arrays: Arrays) -> Terms:
+        """Terms of the log posterior at x, to be traced: derivatives can be taken of it."""
+        found, rows = self._runner.run(x, arrays, {}), {}
+        for name, observed in self._runner.around(found.parameters).items():
+            density = whiten.log_prob(observed, found.values[name])
+            rows[name] = jnp.zeros(self._runner.shapes[name]).at[0].set(density)
+        return Terms(self._runner.rows.stack(rows).sum(1), found.prior, found.local)
+
+    @cached_property
+    def _many(self) -> Callable[[np.ndarray], Terms]:
+        """Points (n, dimension), at most `_POINTS` -> the terms of so many points, zero beyond the given ones.
+
+        One program serves single points and lines of them: how many there are is known only when it runs.
+        """
+
+        @jax.jit
+        def many(xs: jax.Array, count: Any, arrays: Arrays) -> Terms:
+            def put(i: Any, into: Terms) -> Terms:
+                return jax.tree.map(lambda all_, new: all_.at[i].set(new), into, self.terms(xs[i], arrays))
+
+            shapes = jax.eval_shape(self.terms, xs[0], arrays)
+            nothing = jax.tree.map(lambda s: jnp.zeros((len(xs), *s.shape), s.dtype), shapes)
+            return jax.lax.fori_loop(0, count, put, nothing)
+
+        def padded(xs: np.ndarray) -> Terms:
+            whole = np.zeros((_POINTS, xs.shape[1]))
+            whole[: len(xs)] = xs
+            return many(whole, len(xs), self.arrays)
+
+        return padded
+
+    def evaluate(self, x: np.ndarray) -> Terms:
+        """Log likelihood per cluster, log prior of global nuisances, log prior of local ones per cluster at x."""
+        likelihood, prior, local = self._many(np.asarray(x)[None])
+        return Terms(np.asarray(likelihood)[0], np.asarray(prior)[0], np.asarray(local)[0])
+
+    def by_cluster(self, x: np.ndarray) -> np.ndarray:
+        """Log likelihood and log prior of local nuisances at x, per cluster (cluster,)."""
+        likelihood, _, local = self.evaluate(x)
+        return likelihood + local
+
+    def profile(self, xs: np.ndarray) -> np.ndarray:
+        """Log posterior of the base nuisances (n,) at points (n, dimension), one after another."""
+        values = []
+        for start in range(0, len(xs), _POINTS):
+            part = xs[start : start + _POINTS]
+            likelihood, prior, local = (np.asarray(term)[: len(part)] for term in self._many(part))
+            values.append(likelihood.sum(1) + prior + local.sum(1))
+        return np.concatenate(values)
+
+    def residual(self, x: np.ndarray) -> jax.Array:
+        """Whitened residuals (cluster, row) at x."""
+        return self.linearised(x, np.zeros((0, self._runner.layout.dimension)))[0]
+
+    @cached_property
+    def linearised(self) -> Callable[[np.ndarray, np.ndarray], tuple[jax.Array, jax.Array]]:
+        """(x, basis (k, dimension)) -> whitened residuals (cluster, row) and tangents (cluster, row, k)."""
+
+        @jax.jit
+        def linearised(x: Any, basis: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
+            def parameters(x: Any) -> tuple[dict[str, whiten.Parameters], dict[str, jax.Array]]:
+                found = self._runner.run(x, arrays, {})
+                return found.parameters, found.values
+
+            here, push, values = jax.linearize(parameters, x, has_aux=True)
+            observations = self._runner.around(here)
+            residual = {n: whiten.residual(o, values[n]) for n, o in observations.items()}
+
+            def shifted(direction: jax.Array) -> jax.Array:
+                tangent = push(direction)
+                return self._runner.rows.stack(
+                    {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
+                )
+
+            return self._runner.rows.stack(residual), jnp.moveaxis(jax.vmap(shifted)(basis), 0, -1)
+
+        def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[jax.Array, jax.Array]:
+            parts = [linearised(jnp.asarray(x), chunk, self.arrays) for chunk in _chunks(basis)]
+            columns = parts[0][1] if len(parts) == 1 else jnp.concatenate([c for _, c in parts], axis=-1)
+            return parts[0][0], columns[..., : len(basis)]
+
+        return chunked
+
+    def replicate(self, x: np.ndarray, keys: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        """Whitened residuals (n, cluster, row) and observed values (n, ...) by site, drawn at x with keys (n,)."""
+        families = tuple(self._runner.families.items())
+        return _replicate(self._state(x).observed, keys, self._runner.rows.gather, families=families)
+
+    @cached_property
+    def site_gradient(self) -> Any:
+        """(x, rows (n, cluster, row)) -> for each deterministic site, gradients (n, ...) of <rows, whitened shift>."""
+
+        @quick_jit
+        def site_gradient(x: Any, rows: jax.Array, arrays: Any) -> dict[str, jax.Array]:
+            zero = {name: jnp.zeros(s.shape, s.dtype) for name, s in self._float_sites.items()}
+
+            def parameters(deltas: Mapping[str, Any]) -> dict[str, whiten.Parameters]:
+                return self._runner.run(x, arrays, deltas).parameters
+
+            here, push = jax.linearize(parameters, zero)
+            observations = self._runner.around(here)
+
+            def inner(deltas: Mapping[str, Any], row: jax.Array) -> jax.Array:
+                tangent = push(deltas)
+                shifts = {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
+                return jnp.sum(row * self._runner.rows.stack(shifts))
+
+            return jax.lax.map(lambda row: jax.grad(inner)(zero, row), rows)
+
+        return lambda x, rows: site_gradient(jnp.asarray(x), rows, self.arrays)
+
+    @cached_property
+    def site_shift(self) -> Any:
+        """(x, {site: perturbations (n, ...)}) -> whitened shifts (cluster, row, n) to first order."""
+
+        @quick_jit
+        def site_shift(x: Any, deltas: dict[str, jax.Array], arrays: Any) -> jax.Array:
+            zero = {name: jnp.zeros(s.shape, s.dtype) for name, s in self._float_sites.items()}
+
+            def parameters(moved: dict[str, jax.Array]) -> dict[str, whiten.Parameters]:
+                return self._runner.run(x, arrays, moved).parameters
+
+            here, push = jax.linearize(parameters, zero)
+            observations = self._runner.around(here)
+
+            def shifted(delta: dict[str, jax.Array]) -> jax.Array:
+                tangent = push(delta)
+                return self._runner.rows.stack(
+                    {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
+                )
+
+            return jnp.moveaxis(jax.lax.map(shifted, deltas), 0, -1)
+
+        def chunked(x: np.ndarray, deltas: Mapping[str, np.ndarray]) -> jax.Array:
+            n = len(next(iter(deltas.values())))
+            parts = [site_shift(jnp.asarray(x), chunk, self.arrays) for chunk in self._padded(deltas, n)]
+            return jnp.concatenate(parts, axis=-1)[..., :n]
+
+        return chunked
+
+    @cached_property
+    def shifted_likelihood(self) -> Any:
+        """(x, {site: perturbations (n, *site)}, n) -> log likelihood (n,) of the perturbed model."""
+
+        @quick_jit
+        def shifted_likelihood(x: Any, deltas: dict[str, jax.Array], arrays: Any) -> jax.Array:
+            def one(delta: dict[str, jax.Array]) -> jax.Array:
+                return self._likelihood(self._runner.run(x, arrays, delta))
+
+            return jax.lax.map(one, deltas)
+
+        def chunked(x: np.ndarray, deltas: Mapping[str, Any], n: int) -> np.ndarray:
+            parts = [
+                shifted_likelihood(jnp.asarray(x), chunk, self.arrays) for chunk in self._padded(deltas, n)
+            ]
+            return np.concatenate([np.asarray(part) for part in parts])[:n]
+
+        return chunked
+
+    def _likelihood(self, found: Outcome) -> jax.Array:
+        """Log likelihood of all data."""
+        observed = self._runner.around(found.parameters).items()
+        return jnp.sum(jnp.stack([jnp.sum(whiten.log_prob(o, found.values[n])) for n, o in observed]))
+
+    def _padded(self, deltas: Mapping[str, Any], n: int) -> Iterator[dict[str, jax.Array]]:
+        """Perturbations of all sites in chunks of one size, zero where none is given."""
+        for start in range(0, n, CHUNK):
+            chunk = dict(self._nowhere)
+            for name, given in deltas.items():
+                chunk[name] = _filled(np.asarray(given[start : start + CHUNK]), self._nowhere[name])
+            yield chunk
+
+    @cached_property
+    def _nowhere(self) -> dict[str, jax.Array]:
+        """One chunk of perturbations that perturb nothing."""
+        return {n: jnp.zeros((CHUNK, *s.shape), s.dtype) for n, s in self._float_sites.items()}
+
+    @cached_property
+    def _state(self) -> Callable[[np.ndarray], _State]:
+        @quick_jit
+        def state(x: Any, arrays: Any) -> _State:
+            found = self._runner.run(x, arrays, {})
+            error, signal = {}, {}
+            for name, o in self._runner.around(found.parameters).items():
+                zero = jnp.zeros(self._runner.shapes[name])
+                squared, power = _squared_error(o, found.values[name])
+                error[name], signal[name] = zero.at[0].set(squared), zero.at[0].set(power)
+            return _State(
+                found.sites,
+                found.parameters,
+                self._runner.rows.stack(error).sum(1),
+                self._runner.rows.stack(signal).sum(1),
+            )
+
+        return lambda x: state(jnp.asarray(x), self.arrays)
+
+    def sites(self, x: np.ndarray) -> dict[str, jax.Array]:
+        """Values of the latent and deterministic sites at x, by name."""
+        return self._state(x).sites
+
+    def observations(self, x: np.ndarray) -> dict[str, whiten.Observation]:
+        """The observed distributions at x, by site."""
+        return self._runner.around(self._state(x).observed)
+
+    def prediction_error(self, x: np.ndarray) -> tuple[jax.Array, jax.Array]:
+        """Squared error and squared signal of each cluster (cluster,), over observations with a location.
+
+        For log-normal observations, as received powers are, the error is in dB and the signal counts entries.
+        """
+        state = self._state(x)
+        return state.error, state.signal
+
+    @cached_property
+    def prior(self) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
+        """(x, basis (k, dimension)) -> gradient of the log prior of the base latents, minus its Hessian times the basis."""
+
+        @quick_jit
+        def prior(x: Any, basis: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
+            slope, push = jax.linearize(lambda y: jax.grad(self._runner.log_prior)(y, arrays), x)
+            return slope, -jax.vmap(push)(basis)
+
+        def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            parts = [prior(jnp.asarray(x), chunk, self.arrays) for chunk in _chunks(basis)]
+            return np.asarray(parts[0][0]), np.concatenate([c for _, c in parts])[: len(basis)]
+
+        return chunked
+
+
+class Terms(NamedTuple):
+    """Terms of the log posterior: log likelihood of clusters, log prior of global nuisances, of clusters' own."""
+
+    likelihood: Any
+    prior: Any
+    local: Any
+
+
+class _State(NamedTuple):
+    """What a model says at a point: its sites, observed distributions, squared errors and squared signal of clusters."""
+
+    sites: dict[str, jax.Array]
+    observed: dict[str, whiten.Parameters]
+    error: jax.Array
+    signal: jax.Array
+
+
+@partial(jax.jit, static_argnames="families")
+def _replicate(
+    parameters: Mapping[str, whiten.Parameters],
+    keys: jax.Array,
+    gather: np.ndarray,
+    *,
+    families: tuple[tuple[str, str], ...],
+) -> tuple[jax.Array, dict[str, jax.Array]]:
+    """Draws of observations of these families: whitened residuals (n, cluster, row), and values (n, ...) by site."""
+    observations = {n: whiten.Observation(f, parameters[n]) for n, f in families}
+
+    def one(key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
+        split = zip(observations.items(), jax.random.split(key, len(observations)), strict=True)
+        values = {name: whiten.sample(o, k) for (name, o), k in split}
+        return stacked({n: whiten.residual(o, values[n]) for n, o in observations.items()}, gather), values
+
+    return jax.lax.map(one, keys)
+
+
+def _filled(given: np.ndarray, like: jax.Array) -> jax.Array:
+    """Perturbations of one site (n, ...) as one whole chunk."""
+    part = np.zeros(like.shape, like.dtype)
+    part[: len(given)] = given
+    return jnp.asarray(part)
+
+
+def _chunks(basis: np.ndarray) -> Iterator[jax.Array]:
+    """Rows of a basis in chunks of one size, at least one, the last filled up with zeros."""
+    count = max(-(-len(basis) // CHUNK), 1)
+    padded = np.concatenate([basis, np.zeros((count * CHUNK - len(basis), basis.shape[1]))])
+    for start in range(0, len(padded), CHUNK):
+        yield jnp.asarray(padded[start : start + CHUNK])
+
+
+def _squared_error(
+    observation: whiten.Observation, value: jax.Array
+) -> tuple[jax.Array | float, jax.Array | float]:
+    """Squared error and squared signal of an observation by entry; none where it has no location."""
+    if "loc" not in observation.parameters:
+        return 0.0, 0.0
+    loc = observation.parameters["loc"]
+    if observation.family == "LogNormal":
+        error = _DECIBELS * (jnp.log(value) - loc)
+        return observation.masked(error**2), observation.masked(jnp.ones_like(error))
+    return observation.masked(jnp.abs(value - loc) ** 2), observation.masked(jnp.abs(value) ** 2)

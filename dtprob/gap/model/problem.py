@@ -1,0 +1,374 @@
+"""A model on data, with a few live effects, as differentiable functions of one flat vector.
+
+The functions are compiled once per model, data shapes and set of live effects. All other candidates enter to first order
+only: their directions at the sites (see `directions`) are pushed through the same compiled model, so that screening
+hundreds of effects needs no compilation of theirs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from copy import copy
+from functools import cached_property
+from typing import Any, cast, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects.effect import FIELD, Context, Effect, Rewriting
+from dtprob.errors import InputError
+from dtprob.gap.model.compiled import Compiled
+from dtprob.gap.model.layout import Block, Layout, make_layout, normal_of, transform_of
+from dtprob.gap.model.programs import Programs
+from dtprob.gap.model.quick import quick_jit
+from dtprob.gap.model.rows import Rows, make_rows
+from dtprob.gap.model.running import Arrays, Runner, observations
+from dtprob.gap.model.volume import Volume
+from dtprob.gap.observation import whiten
+from dtprob.inference.posterior import Sampler
+from dtprob.models.declaration import Data, Declaration, Model, declare, split_static, trace_model
+
+_REFERENCE_DRAWS = 1000
+_MIDDLE = 2.563
+"""Standard deviations between the first and the last tenth of a normal distribution."""
+
+
+@final
+class Problem:
+    """Compiled views of a model with live effects on given data.
+
+    Args:
+        model: the base model.
+        data: its arguments by name.
+        effects: all candidates.
+        cluster: axis or data column whose values are independent of one another.
+        reference: draws of the nuisances from earlier data; their normal approximation replaces the prior.
+
+    Raises:
+        InputError: the data do not fit the model, an effect names no site of the model, or the cluster is unknown.
+    """
+
+    def __init__(
+        self,
+        model: Model,
+        data: Data,
+        effects: Sequence[Effect],
+        cluster: str | None = None,
+        reference: Sampler | None = None,
+    ) -> None:
+        self.model, self.data, self.effects = model, dict(data), tuple(effects)
+        column = cluster if cluster is not None and cluster in data and np.ndim(data[cluster]) == 1 else None
+        self.declaration: Declaration = declare(model, data, cluster=None if column else cluster)
+        self.arrays, self._static = split_static(data)
+        self._check_effects()
+        self._column = column
+        self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.per_cluster: frozenset[str] = frozenset()
+        self.volume: Volume | None = None
+        self.set_live(())
+        if reference is not None:
+            self.known = normal_of(self._reference_draws(reference))
+            self.set_live(())
+
+    def set_live(self, live: tuple[Effect, ...]) -> None:
+        """Index rows and coordinates for a set of live effects; nothing is compiled yet."""
+        self.__dict__.pop("compiled", None)
+        self.live = live
+        shapes, families = self._observed_shapes()
+        self.located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
+        joint = [n for n, f in families.items() if whiten.is_joint(f)]
+        self.rows: Rows = make_rows(
+            self.declaration, shapes, self.located, self.data, self._column, joint=joint
+        )
+        self.layout: Layout = self._make_layout()
+        self._runner = Runner(
+            self.model,
+            self.declaration,
+            self._static,
+            live,
+            self.layout,
+            self.rows,
+            shapes,
+            families,
+            frozenset(self.known),
+        )
+
+    def with_live(self, names: Sequence[str]) -> Problem:
+        """The same problem with other live effects; what does not depend on them is shared."""
+        if set(names) <= {e.name for e in self.live}:
+            return self
+        _ = self.programs, self.float_sites, self.field_shapes, self._draw  # made once, then shared
+        other = copy(self)
+        other.set_live(tuple(e for e in self.effects if e.name in names))
+        return other
+
+    def with_fields(self, fields: Sequence[Effect], per_cluster: Sequence[str] = ()) -> Problem:
+        """The same problem with more variance effects, live beside those that are; no other is a candidate any more.
+
+        Args:
+            fields: the effects.
+            per_cluster: names of those whose field has a row for each cluster, whatever the axes of the site.
+        """
+        _ = self.float_sites  # as the candidates have grown them
+        other = copy(self)
+        other.effects, other.per_cluster = (*self.live, *fields), frozenset(per_cluster)
+        for name in ("programs", "field_shapes"):
+            other.__dict__.pop(name, None)
+        other.set_live(other.effects)
+        return other
+
+    def with_volume(self, volume: Volume | None) -> Problem:
+        """The same problem, in which the clusters' own unknowns are integrated out as the volume says."""
+        other = copy(self)
+        other.volume = volume
+        return other
+
+    @cached_property
+    def compiled(self) -> Compiled:
+        """Functions of the flat vector."""
+        return Compiled(self._runner, Arrays(self.arrays, self.known), self.float_sites)
+
+    def translate(self, x: np.ndarray, source: Problem) -> np.ndarray:
+        """A point of another problem on the same model as a point of this one; what that lacks is at its null."""
+        result = self.null()
+        self.layout.copy_into(result, source.layout, x)
+        return result
+
+    @cached_property
+    def programs(self) -> Programs:
+        """Compiled derivatives of all candidates."""
+        return Programs(self.effects, self.data)
+
+    def _check_effects(self) -> None:
+        for effect in self.effects:
+            missing = [site for site in effect.sites if site not in self.declaration.sites]
+            if missing:
+                raise InputError(
+                    f"effect {effect.name}",
+                    f"a site among {', '.join(self.declaration.sites)}",
+                    ", ".join(missing),
+                    "Name the site with numpyro.deterministic in the model, or leave the effect out",
+                )
+
+    # -- sizes and names ------------------------------------------------------------------------------------------
+
+    @property
+    def n_cluster(self) -> int:
+        """Number of clusters."""
+        return self.rows.n_cluster
+
+    @property
+    def cluster_name(self) -> str:
+        """Axis or column of the clusters."""
+        return self.rows.cluster_name
+
+    @property
+    def dimension(self) -> int:
+        """Length of the flat vector."""
+        return self.layout.dimension
+
+    @property
+    def n_observation(self) -> int:
+        """Observed entries, a complex one counted once."""
+        return sum(site.size for site in self.declaration.observed.values())
+
+    @property
+    def components(self) -> dict[str, int]:
+        """Whitened rows per entry of each observed site."""
+        return {name: shape[0] for name, shape in self._runner.shapes.items()}
+
+    @property
+    def has_powers(self) -> bool:
+        """Whether all that is observed is log-normal, as received powers are, so that its errors are in dB."""
+        return set(self._runner.families.values()) == {"LogNormal"}
+
+    @property
+    def rows_per_observation(self) -> float:
+        """Whitened rows per observed entry."""
+        return len(self.rows.ids) / max(self.n_observation, 1)
+
+    @cached_property
+    def observed_values(self) -> dict[str, jax.Array]:
+        """The data of each observed site."""
+
+        @quick_jit
+        def run(arrays: Any) -> dict[str, jax.Array]:
+            trace = trace_model(self.model, eqx.combine(arrays, self._static), jax.random.key(0))
+            return {name: jnp.asarray(trace[name]["value"]) for name in self.declaration.observed}
+
+        return run(self.arrays)
+
+    def blocks_of(self, owner: str | None) -> list[Block]:
+        """The blocks of a live effect by its name, or of the base model's nuisances."""
+        return [block for block in self.layout.blocks if block.owner == owner]
+
+    @cached_property
+    def float_sites(self) -> dict[str, jax.ShapeDtypeStruct]:
+        """Deterministic sites on which a perturbation makes sense, in the largest shape that a candidate gives them."""
+
+        def run(arrays: Any) -> dict[str, Any]:
+            data = eqx.combine(arrays, self._static)
+            grown = dict[str, Any]()
+            while True:  # a site may grow because one before it has
+                found = self._runner.run(jnp.zeros(self.dimension), Arrays(arrays, self.known), grown)
+                values = {n: found.sites[n] for n in self.declaration.deterministic}
+                context = Context(data, found.everything)
+                grown = {n: jnp.zeros(s, values[n].dtype) for n, s in self._largest(values, context).items()}
+                if all(grown[n].shape == values[n].shape for n in values):
+                    return grown
+
+        sites = cast("dict[str, Any]", jax.eval_shape(run, self.arrays))
+        return {n: s for n, s in sites.items() if jnp.issubdtype(s.dtype, jnp.inexact) and s.size}
+
+    def _largest(self, values: Mapping[str, Any], context: Context) -> dict[str, tuple[int, ...]]:
+        """The largest shape that any candidate gives each deterministic site."""
+        shapes = {name: value.shape for name, value in values.items()}
+        for effect in self.effects:
+            parameters = effect.null()
+            if effect.kind == "variance":
+                parameters[FIELD] = jnp.zeros(effect.shape_of_field(values[effect.sites[0]], context))
+            for site, rewrite in effect.rewrites.items():
+                shape = jnp.shape(rewrite(values[site], parameters, context))
+                shapes[site] = np.broadcast_shapes(shapes[site], shape)
+        return shapes
+
+    @cached_property
+    def field_shapes(self) -> dict[str, tuple[int, ...]]:
+        """Shape of the field of each variance effect."""
+        fields = [e for e in self.effects if e.kind == "variance"]
+
+        def run(arrays: Any) -> dict[str, jax.Array]:
+            data = eqx.combine(arrays, self._static)
+            trace = trace_model(self.model, data, jax.random.key(0))
+            context = Context(data, {n: m["value"] for n, m in trace.items()})
+            shapes = {}
+            for effect in fields:
+                value = trace[effect.sites[0]]["value"]
+                grown = self.float_sites.get(effect.sites[0])
+                value = value if grown is None else jnp.broadcast_to(value, grown.shape)
+                shapes[effect.name] = jnp.zeros(effect.shape_of_field(value, context))
+            return shapes
+
+        return {n: tuple(v.shape) for n, v in jax.eval_shape(run, self.arrays).items()}
+
+    def _observed_shapes(self) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
+        families: dict[str, str] = {}
+
+        def run(arrays: Any) -> dict[str, jax.Array]:
+            data = eqx.combine(arrays, self._static)
+            means = [e for e in self.live if e.kind == "mean"]
+            with Rewriting(None, means, {e.name: e.null() for e in means}, data):
+                trace = trace_model(self.model, data, jax.random.key(0))
+            observed = observations(self.declaration, trace)
+            families.update({n: o.family for n, o in observed.items()})
+            return {n: whiten.residual(o, trace[n]["value"]) for n, o in observed.items()}
+
+        shapes = cast("dict[str, Any]", jax.eval_shape(run, self.arrays))
+        return {name: tuple(shapes[name].shape) for name in families}, families
+
+    def _make_layout(self) -> Layout:
+        def run(arrays: Any) -> dict[str, Any]:
+            data = eqx.combine(arrays, self._static)
+            trace = trace_model(self.model, data, jax.random.key(0))
+            return {
+                n: jnp.zeros(transform_of(trace[n]["fn"]).inverse_shape(jnp.shape(trace[n]["value"])))
+                for n in self.declaration.latent
+            }
+
+        shapes = {
+            n: tuple(v.shape) for n, v in cast("dict[str, Any]", jax.eval_shape(run, self.arrays)).items()
+        }
+        entries: list[tuple[str, str | None, tuple[int, ...], tuple[str, ...]]] = []
+        for name, site in self.declaration.latent.items():
+            entries.append(
+                (name, None, shapes[name], site.axes if len(site.axes) == len(shapes[name]) else ())
+            )
+        for effect in self.live:
+            if effect.kind == "variance":
+                own = (str(self.declaration.cluster),)
+                axes = (
+                    own if effect.name in self.per_cluster else self.declaration.sites[effect.sites[0]].axes
+                )
+                entries.append((effect.site_name(FIELD), effect.name, self.field_shapes[effect.name], axes))
+            else:
+                entries += [(effect.site_name(p.name), effect.name, p.shape, ()) for p in effect.parameters]
+        return make_layout(entries, str(self.declaration.cluster), self.rows.n_cluster)
+
+    # -- points ---------------------------------------------------------------------------------------------------
+
+    def null(self) -> np.ndarray:
+        """The flat vector with live effects at their null and latent sites at zero."""
+        x = np.zeros(self.dimension)
+        for effect in self.live:
+            for parameter in effect.parameters if effect.kind == "mean" else ():
+                self.layout.put(x, effect.site_name(parameter.name), np.full(parameter.shape, parameter.null))
+        return x
+
+    def start(self, values: Mapping[str, Any]) -> np.ndarray:
+        """The flat vector at constrained values of all latent sites, live effects at their null."""
+        trace = trace_model(self.model, self.data, jax.random.key(0), dict(values))
+        x = self.null()
+        for name in self.declaration.latent:
+            self.layout.put(x, name, transform_of(trace[name]["fn"]).inv(jnp.asarray(values[name])))
+        return x
+
+    def prior_draws(self, key: jax.Array, n: int) -> np.ndarray:
+        """Flat vectors (n, dimension) of prior draws of the latent sites, live effects at their null."""
+        x = np.repeat(self.null()[None], n, axis=0)
+        for name, value in self._draw(jax.random.split(key, n), self.arrays).items():
+            if value[0].size:
+                offset = self.layout[name].offset
+                x[:, offset : offset + value[0].size] = np.asarray(value).reshape(n, -1)
+        return np.where(np.isfinite(x), x, 0.0)
+
+    @cached_property
+    def _draw(self) -> Any:
+        """(keys (n,), arrays) -> unconstrained prior draws (n, ...) of the latent sites, whatever effects are live."""
+
+        @quick_jit
+        def draw(keys: jax.Array, arrays: Any) -> dict[str, Any]:
+            def one(key: jax.Array) -> dict[str, Any]:
+                trace = trace_model(self.model, eqx.combine(arrays, self._static), key)
+                return {
+                    m: transform_of(trace[m]["fn"]).inv(trace[m]["value"]) for m in self.declaration.latent
+                }
+
+            return jax.lax.map(one, keys)
+
+        return draw
+
+    @cached_property
+    def prior_middle(self) -> tuple[np.ndarray, np.ndarray]:
+        """Median and standard deviation, by the middle eight tenths of the prior, of each coordinate (dimension,)."""
+        draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
+        low, middle, high = np.quantile(draws, [0.1, 0.5, 0.9], axis=0)
+        return middle, (high - low) / _MIDDLE
+
+    @cached_property
+    def usual(self) -> dict[str, tuple[float, float]]:
+        """Centre and standard deviation, by the middle eight tenths of the prior, of the base model's latent sites."""
+        middle, deviation = self.prior_middle
+        blocks = [(b.name, b.index) for b in self.blocks_of(None) if b.size]
+        return {name: (float(np.median(middle[i])), float(np.median(deviation[i]))) for name, i in blocks}
+
+    def initial(self, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, jax.Array]:
+        """Constrained values at x of the latent sites and of the given live mean effects' parameters, by site name."""
+        values = self.compiled.sites(x)
+        own = [e.site_name(p.name) for e in effects for p in e.parameters]
+        parts = {name: self.layout.part(jnp.asarray(x), name) for name in own}
+        return {**{name: values[name] for name in self.declaration.latent}, **parts}
+
+    def _reference_draws(self, reference: Sampler) -> dict[str, np.ndarray]:
+        """Unconstrained draws (draw, size) of the global latent sites that a reference knows."""
+        draws = reference.sample(jax.random.key(0), _REFERENCE_DRAWS)
+        names = [b.name for b in self.blocks_of(None) if not b.local and b.name in draws]
+
+        def unconstrain(given: Mapping[str, Any], arrays: Any) -> dict[str, Any]:
+            trace = trace_model(self.model, eqx.combine(arrays, self._static), jax.random.key(0), given)
+            return {n: transform_of(trace[n]["fn"]).inv(given[n]).reshape(-1) for n in names}
+
+        chosen = {n: jnp.asarray(draws[n]) for n in names}
+        flat = jax.vmap(unconstrain, in_axes=(0, None))(chosen, self.arrays)
+        return {name: np.asarray(value) for name, value in flat.items()}

@@ -1,0 +1,169 @@
+"""The compiled derivatives of all candidate effects at the sites."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, Final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects.effect import FIELD, Context, Effect
+from dtprob.gap.model.quick import Hoisted
+from dtprob.models.declaration import Data, split_static
+
+TRIALS: Final = 16
+"""Sizes of each effect that are tried in one run."""
+
+
+class Programs:
+    """The compiled derivatives of all candidates, shared by every fit of one diagnosis.
+
+    Sites come in the largest shape that any candidate gives them, so one compilation serves all fits.
+    """
+
+    def __init__(self, effects: Sequence[Effect], data: Data) -> None:
+        self._arrays, static = split_static(data)
+        means = [e for e in effects if e.kind == "mean" and e.rewrites]
+        fields = [e for e in effects if e.kind == "variance"]
+
+        def tangents(values: Mapping[str, jax.Array], arrays: Any) -> dict[str, dict[str, jax.Array]]:
+            context = Context(eqx.combine(arrays, static), values)
+            return {e.name: {s: _derivative(e, s, values[s], context) for s in e.rewrites} for e in means}
+
+        def energy(
+            values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], arrays: Any
+        ) -> dict[str, jax.Array]:
+            context = Context(eqx.combine(arrays, static), values)
+            return {e.name: _field_energy(e, values, gradients, context) for e in fields}
+
+        def trials(
+            values: Mapping[str, jax.Array], sizes: Mapping[str, jax.Array], arrays: Any
+        ) -> dict[str, dict[str, jax.Array]]:
+            context = Context(eqx.combine(arrays, static), values)
+            return {e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in means}
+
+        self._tangents, self._energy, self._trials = Hoisted(tangents), Hoisted(energy), Hoisted(trials)
+        self._nulls = {e.name: np.asarray(null_vector(e)) for e in means}
+
+    def site_tangents(self, values: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
+        """For each mean effect and rewritten site the derivative (*site, parameter) at the null."""
+        return self._tangents(dict(values), self._arrays)
+
+    def trial_shifts(
+        self, values: Mapping[str, jax.Array], sizes: Mapping[str, np.ndarray]
+    ) -> Iterator[tuple[str, slice, dict[str, jax.Array]]]:
+        """For each named effect, its rewritten sites less their values at flat parameters (trial, n).
+
+        Yields:
+            name, which of its trials, and for each site the shifts (trial, *site); all effects in portions of one
+            size, so that nothing is compiled anew.
+        """
+        longest = max((len(v) for v in sizes.values()), default=0)
+        for start in range(0, longest, TRIALS):
+            portion = {n: v[start : start + TRIALS] for n, v in sizes.items() if len(v) > start}
+            shifts = self._trials(
+                dict(values), {n: self._filled(n, portion) for n in self._nulls}, self._arrays
+            )
+            for name, part in portion.items():
+                moved = {site: shift[: len(part)] for site, shift in shifts[name].items()}
+                yield name, slice(start, start + len(part)), moved
+
+    def _filled(self, name: str, portion: Mapping[str, np.ndarray]) -> np.ndarray:
+        """One portion of an effect's trials, the null where there are none."""
+        rows = np.repeat(self._nulls[name][None], TRIALS, axis=0)
+        if name in portion:
+            rows[: len(portion[name])] = portion[name]
+        return rows
+
+    def field_energy(
+        self, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array]
+    ) -> dict[str, np.ndarray]:
+        """Weighted sums of squared field scores (n, weighting) of each variance effect, the first with equal weights.
+
+        Args:
+            values: of the sites, at the fit.
+            gradients: of the data and then of replicates under the fit, (n, *site) for each site.
+        """
+        found = self._energy(dict(values), dict(gradients), self._arrays)
+        return {name: np.asarray(value) for name, value in found.items()}
+
+
+def unflatten(effect: Effect, flat: jax.Array) -> dict[str, jax.Array]:
+    """Parameters by name from one flat vector."""
+    result, low = {}, 0
+    for parameter in effect.parameters:
+        size = int(np.prod(parameter.shape, dtype=int))
+        result[parameter.name] = flat[low : low + size].reshape(parameter.shape)
+        low += size
+    return result
+
+
+def null_vector(effect: Effect) -> jax.Array:
+    """The null of all parameters as one flat vector."""
+    return jnp.concatenate([jnp.full(p.shape, p.null).reshape(-1) for p in effect.parameters])
+
+
+def _derivative(effect: Effect, site: str, value: jax.Array, context: Context) -> jax.Array:
+    def moved(flat: jax.Array) -> jax.Array:
+        return jnp.asarray(effect.rewrites[site](value, unflatten(effect, flat), context)).astype(value.dtype)
+
+    null = null_vector(effect)
+    if len(null) > 1:
+        return jax.jacfwd(moved)(null)
+    return jax.jvp(moved, (null,), (jnp.ones(1),))[1][..., None]  # half the tracing
+
+
+def _trial_shifts(
+    effect: Effect, values: Mapping[str, jax.Array], context: Context, sizes: jax.Array
+) -> dict[str, jax.Array]:
+    def one(flat: jax.Array) -> dict[str, jax.Array]:
+        parameters, result = unflatten(effect, flat), {}
+        for site, rewrite in effect.rewrites.items():
+            new = jnp.asarray(rewrite(values[site], parameters, context)).astype(values[site].dtype)
+            result[site] = new - values[site]
+        return result
+
+    return jax.vmap(one)(sizes)
+
+
+def _field_energy(
+    effect: Effect, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], context: Context
+) -> jax.Array:
+    shape = effect.shape_of_field(values[effect.sites[0]], context)
+    unit = {p.name: jnp.ones(p.shape) for p in effect.parameters}
+    sites = [site for site in effect.rewrites if site in gradients]
+
+    def moved(field: jax.Array) -> dict[str, jax.Array]:
+        result = {}
+        for site in sites:
+            new = jnp.asarray(effect.rewrites[site](values[site], {**unit, FIELD: field}, context))
+            result[site] = jnp.broadcast_to(new.astype(values[site].dtype), gradients[site].shape[1:])
+        return result
+
+    _, pull = jax.vjp(moved, jnp.zeros(shape))
+    chosen = {site: gradients[site] for site in sites}
+
+    def square(gradient: Mapping[str, jax.Array]) -> jax.Array:
+        return pull(gradient)[0] ** 2
+
+    def add(total: jax.Array, gradient: Mapping[str, jax.Array]) -> tuple[jax.Array, None]:
+        return total + square(gradient), None
+
+    replicates = {site: value[1:] for site, value in chosen.items()}
+    total, _ = jax.lax.scan(add, jnp.zeros(shape), replicates)
+    information = total / max(len(next(iter(replicates.values()))), 1)
+    return jax.lax.map(lambda g: _weights(information) @ square(g).reshape(-1), chosen)
+
+
+def _weights(information: jax.Array) -> jax.Array:
+    """Weights (1 + reference, entry) of squared scores: equal for a faint field, inverse to the information for a strong.
+
+    The best test of entries with variance s^2 weights them by 1 / (1 + s^2 J); s^2 J is 1 at quantiles of J in turn.
+    """
+    flat = information.reshape(-1)
+    reference = jnp.quantile(flat, jnp.array([0.9, 0.5, 0.1])) * jnp.array([1.0, 1.0, 0.1])
+    reference = jnp.maximum(reference, 1e-12 * jnp.max(flat, initial=0.0) + 1e-300)
+    return jnp.concatenate([jnp.ones((1, flat.size)), 1.0 / (1.0 + flat / reference[:, None])])

@@ -1,0 +1,176 @@
+"""Running a model with live effects at a flat vector of coordinates, its sites moved if need be."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, NamedTuple, final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from numpyro import handlers
+from numpyro.primitives import Messenger
+
+from dtprob.effects.effect import FIELD, Effect, Rewriting
+from dtprob.gap.model.layout import Layout, fold, transform_of
+from dtprob.gap.model.rows import Rows
+from dtprob.gap.observation import whiten
+from dtprob.models.declaration import Declaration, Model
+
+
+class _Shift(Messenger):
+    """Adds a perturbation to deterministic sites."""
+
+    def __init__(self, deltas: Mapping[str, Any]) -> None:
+        super().__init__(None)
+        self._deltas = deltas
+
+    def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if msg["type"] == "deterministic" and msg["name"] in self._deltas:
+            msg["value"] = msg["value"] + self._deltas[msg["name"]]
+
+
+class Arrays(NamedTuple):
+    """What programs take as arguments, so that they serve all data of the same shapes.
+
+    Attributes:
+        data: arguments of the model that are arrays, by name.
+        known: mean and precision, unconstrained, of nuisances that earlier data inform instead of the prior.
+    """
+
+    data: Any
+    known: Mapping[str, tuple[Any, Any]]
+
+
+class Outcome(NamedTuple):
+    """What a model says at a point.
+
+    Attributes:
+        sites: values of the latent and deterministic sites.
+        values: of the observed ones, the data.
+        parameters: of the observed distributions.
+        prior: log prior of the global base latents.
+        local: log prior of the local ones, per cluster.
+    """
+
+    sites: dict[str, jax.Array]
+    values: dict[str, jax.Array]
+    parameters: dict[str, whiten.Parameters]
+    prior: jax.Array
+    local: jax.Array
+
+    @property
+    def everything(self) -> dict[str, jax.Array]:
+        """Values of all sites."""
+        return {**self.sites, **self.values}
+
+
+@final
+@dataclass(frozen=True)
+class Runner:
+    """A model with live effects; what of its arguments is an array comes with every call.
+
+    Attributes:
+        model: the base model.
+        declaration: its sites.
+        static: its arguments that are no arrays.
+        live: effects whose parameters are coordinates.
+        layout: where each latent site and parameter lies in the flat vector.
+        rows: the whitened rows of the observations.
+        shapes: (component, *site shape) of each observed site's rows.
+        families: the distribution family of each observed site.
+        known: nuisances that earlier data inform instead of the prior.
+    """
+
+    model: Model
+    declaration: Declaration
+    static: Any
+    live: tuple[Effect, ...]
+    layout: Layout
+    rows: Rows
+    shapes: Mapping[str, tuple[int, ...]]
+    families: Mapping[str, str]
+    known: frozenset[str]
+
+    @cached_property
+    def run(self) -> Callable[[Any, Any, Mapping[str, Any]], Outcome]:
+        """(x, arrays, perturbations of sites) -> what the model says there; all that calls it shares one trace."""
+        return jax.jit(self._run)
+
+    def _run(self, x: Any, arrays: Arrays, deltas: Mapping[str, Any]) -> Outcome:
+        data = eqx.combine(arrays.data, self.static)
+        latent = {name: self.layout.part(x, name) for name in self.declaration.latent}
+        jacobians: dict[str, Any] = {}
+
+        def constrain(site: dict[str, Any]) -> Any:
+            if site["type"] != "sample" or site["name"] not in latent:
+                return None
+            transform = transform_of(site["fn"])
+            u = latent[site["name"]]
+            value = transform(u)
+            jacobians[site["name"]] = transform.log_abs_det_jacobian(u, value)
+            return value
+
+        with (
+            handlers.trace() as trace,
+            _Shift(deltas),
+            Rewriting(None, self.live, self._parameters(x), data),
+            handlers.substitute(substitute_fn=constrain),
+            handlers.seed(rng_seed=jax.random.key(0)),
+        ):
+            self.model(**data)
+        total, local = self._reference_prior(x, arrays.known), jnp.zeros(self.rows.n_cluster)
+        for name in self.declaration.latent:
+            if name in self.known:
+                continue
+            fn = trace[name]["fn"]
+            density = fn.log_prob(trace[name]["value"]) + fold(jacobians[name], fn.batch_shape)
+            if self.layout[name].local:
+                axis = self.declaration.sites[name].axes.index(str(self.declaration.cluster))
+                local = local + jnp.moveaxis(density, axis, 0).reshape(self.rows.n_cluster, -1).sum(1)
+            else:
+                total = total + jnp.sum(density)
+        names = [*self.declaration.latent, *self.declaration.deterministic]
+        observed = observations(self.declaration, trace)
+        return Outcome(
+            {n: jnp.asarray(trace[n]["value"]) for n in names},
+            {n: jnp.asarray(trace[n]["value"]) for n in observed},
+            {n: o.parameters for n, o in observed.items()},
+            total,
+            local,
+        )
+
+    def _parameters(self, x: Any) -> dict[str, dict[str, Any]]:
+        parameters: dict[str, dict[str, Any]] = {}
+        for effect in self.live:
+            if effect.kind == "mean":
+                names = {p.name: effect.site_name(p.name) for p in effect.parameters}
+                parameters[effect.name] = {name: self.layout.part(x, site) for name, site in names.items()}
+            else:
+                unit = {p.name: jnp.ones(p.shape) for p in effect.parameters}
+                parameters[effect.name] = {**unit, FIELD: self.layout.part(x, effect.site_name(FIELD))}
+        return parameters
+
+    def _reference_prior(self, x: Any, known: Mapping[str, tuple[Any, Any]]) -> jax.Array:
+        """Log density, up to a constant, of the nuisances that a reference informs."""
+        total = jnp.zeros(())
+        for name, (mean, precision) in known.items():
+            d = self.layout.part(x, name).reshape(-1) - mean
+            total = total - 0.5 * d @ (precision @ d)
+        return total
+
+    def around(self, parameters: Mapping[str, whiten.Parameters]) -> dict[str, whiten.Observation]:
+        """The observed distributions with given parameters."""
+        return {n: whiten.Observation(f, dict(parameters[n])) for n, f in self.families.items()}
+
+    def log_prior(self, x: Any, arrays: Arrays) -> jax.Array:
+        """Log prior of the base latents."""
+        found = self.run(x, arrays, {})
+        return found.prior + jnp.sum(found.local)
+
+
+def observations(declaration: Declaration, trace: Mapping[str, Any]) -> dict[str, whiten.Observation]:
+    """The elementwise distributions of a model's observed sites in a trace."""
+    return {n: whiten.observation(trace[n]["fn"], trace[n]["value"], n) for n in declaration.observed}

@@ -1,0 +1,1 @@
+"""Which measurement tells rival explanations apart."""

@@ -1,0 +1,169 @@
+"""Designs as data of the model: what rival fits predict at clusters that could be measured, or measured again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, Final
+
+import numpy as np
+from jaxtyping import Float
+
+from dtprob.errors import InputError
+from dtprob.gap.diagnosis import Cause
+from dtprob.gap.evidence import Evidence
+from dtprob.gap.fitting.active import activate, basis
+from dtprob.gap.fitting.fit import Fit, fit
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.next_measurement.design import Design, Prediction, Ranked, joined, rank, recommend
+from dtprob.gap.observation import whiten
+from dtprob.gap.which.trials import Start
+from dtprob.models.declaration import Data
+
+_SHOWN: Final = 5
+"""Designs that a report lists."""
+_LOOSE: Final = 1e-6
+"""Prior precision of a cluster's own coordinate, at least, as a share of what its rows tell of it."""
+_AGAIN: Final = "again"
+"""Name of the data that are there, measured once more."""
+
+
+def next_measurement(
+    evidence: Evidence, causes: Sequence[Cause], designs: Mapping[str, Data]
+) -> dict[str, Any] | None:
+    """What to measure so that the explanations that are left can be told apart; None where one alone is left.
+
+    Args:
+        evidence: of the diagnosis.
+        causes: what was found; the first one's class is to be split.
+        designs: arguments of the model for measurements that could be made, by name; each cluster of each is a candidate,
+            beside those that are there, measured again. Observed values in them are not looked at.
+
+    Returns:
+        For report.json: the classes, the recommended designs with their repeats and what they bring, what the same costs by
+        repeating everything, and the best single designs in order.
+    """
+    if not causes or len(causes[0].alias_class) < 2:
+        return None
+    found = evidence.explanations
+    here = evidence.problem.with_live([name for names in causes[0].alias_class for name in names])
+    fits = [_moved(here, found[names]) for names in causes[0].alias_class]
+    again = designs_of(here, here, fits, _AGAIN)
+    candidates = list(again)
+    for name, data in designs.items():
+        candidates += designs_of(_problem_at(here, data), here, fits, name)
+    everything = rank([joined(again)])[0]
+    best = recommend(candidates)
+    return {
+        "split": [list(names) for names in causes[0].alias_class],
+        "design": dict(best.where),
+        "repeats": best.repeats,
+        "gain_nats": best.nats,
+        "resolves": best.resolves,
+        "cost": best.cost,
+        "cost_of_all_again": everything.cost if everything.resolves else None,
+        "ranking": [_line(one) for one in rank(candidates)[:_SHOWN]],
+    }
+
+
+def _moved(here: Problem, at: Start) -> Fit:
+    """A fit in the coordinates of another problem on the same data."""
+    x = here.translate(at.fitted.x, at.problem)
+    return fit(here, x, at.fitted.effects, spread=at.fitted.spread)
+
+
+def designs_of(there: Problem, here: Problem, fits: Sequence[Fit], name: str) -> list[Design]:
+    """Each cluster of a problem as a design of cost 1.
+
+    Args:
+        there: the model on the data of the designs, with the fits' effects live.
+        here: the model on the data that were fitted.
+        fits: of the rivals.
+        name: of the data.
+    """
+    points = [there.translate(fitted.x, here) for fitted in fits]
+    origin = there.compiled.observations(points[0])
+    means = [_shift(there, origin, there.compiled.observations(x)) for x in points]
+    columns = [_columns(there, fitted, x) for fitted, x in zip(fits, points, strict=True)]
+    _check_parameters(there, fits, name)
+    whitened = _whitening(there, fits[0], points[0], columns[0][1])
+    rivals = [
+        (whitened(mean[..., None])[..., 0], whitened(tangents), fitted.covariance)
+        for mean, (tangents, _), fitted in zip(means, columns, fits, strict=True)
+    ]
+    designs = []
+    for cluster in range(there.n_cluster):
+        predictions = tuple(Prediction(mean[cluster], tangents[cluster], c) for mean, tangents, c in rivals)
+        where = {there.cluster_name: _label(there, cluster)}
+        designs.append(Design(where if name == _AGAIN else {"design": name, **where}, 1.0, predictions))
+    return designs
+
+
+def _problem_at(here: Problem, data: Data) -> Problem:
+    """The same model and live effects on other data."""
+    named = here.cluster_name in data or here.cluster_name in {
+        axis for site in here.declaration.observed.values() for axis in site.axes
+    }
+    there = Problem(here.model, data, here.effects, here.cluster_name if named else None)
+    return there.with_live([effect.name for effect in here.live])
+
+
+def _check_parameters(there: Problem, fits: Sequence[Fit], name: str) -> None:
+    """Designs must have the parameters that were fitted."""
+    for fitted in fits:
+        count = len(activate(there, fitted.effects).global_index)
+        if count != len(fitted.covariance):
+            expected = f"the {len(fitted.covariance)} shared parameters of the fit"
+            remedy = "Give designs of the same objects, antennas and devices"
+            raise InputError(f"design {name}", expected, str(count), remedy)
+
+
+def _label(problem: Problem, cluster: int) -> Any:
+    """What the user calls a cluster: the entry of its column, or its number."""
+    column = np.asarray(problem.data.get(problem.cluster_name, 0))
+    names = np.unique(column)
+    return names[cluster].item() if 1 < len(names) == problem.n_cluster < len(column) else cluster
+
+
+def _shift(
+    problem: Problem, origin: Mapping[str, whiten.Observation], other: Mapping[str, whiten.Observation]
+) -> Float[np.ndarray, "cluster row"]:
+    """Whitened difference of the observed distributions' parameters."""
+    rows = {}
+    for name, observed in origin.items():
+        change = {n: other[name].parameters[n] - value for n, value in observed.parameters.items()}
+        rows[name] = whiten.shift(observed, change)
+    return np.asarray(problem.rows.stack(rows))
+
+
+def _columns(problem: Problem, fitted: Fit, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Whitened tangents of the global and of the clusters' own coordinates, (cluster, row, coordinate)."""
+    active = activate(problem, fitted.effects)
+    columns = np.asarray(problem.compiled.linearised(x, basis(problem, active))[1])
+    return columns[..., : len(active.global_index)], columns[..., len(active.global_index) :]
+
+
+def _whitening(
+    problem: Problem, fitted: Fit, x: np.ndarray, own: Float[np.ndarray, "cluster row local"]
+) -> Callable[[np.ndarray], np.ndarray]:
+    """What makes rows (cluster, row, any) independent once clusters' own coordinates are integrated over their prior."""
+    active = activate(problem, fitted.effects)
+    directions = basis(problem, active)[len(active.global_index) :]
+    if not len(directions):
+        return lambda rows: rows
+    curvature = problem.compiled.prior(x, directions)[1]
+    precision = np.stack([row[active.local_index[:, j]] for j, row in enumerate(curvature)], axis=-1)
+    told = np.einsum("cml,cml->cl", own, own)
+    scaled = own / np.sqrt(np.maximum(precision, _LOOSE * np.maximum(told, 1e-300)))[:, None, :]
+    left, size, _ = np.linalg.svd(scaled, full_matrices=False)
+    shrink = 1 - 1 / np.sqrt(1 + size**2)
+    return lambda rows: rows - np.einsum("cmk,ck,cnk,cnj->cmj", left, shrink, left, rows, optimize=True)
+
+
+def _line(one: Ranked) -> dict[str, Any]:
+    return {
+        "design": dict(one.where),
+        "repeats": one.repeats,
+        "gain_nats": one.nats,
+        "cost": one.cost,
+        "resolves": one.resolves,
+    }

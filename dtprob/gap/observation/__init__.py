@@ -1,0 +1,1 @@
+"""Scores of observed distributions as whitened regression rows."""

@@ -1,0 +1,125 @@
+"""Scores of counts, outcomes and classes as whitened regression rows; the counterpart of `residuals` for what is discrete.
+
+A residual takes parameters and values, a shift parameters and a change of each; both give (component, *shape of the value).
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import betainc, digamma
+
+from dtprob.gap.observation.residuals import Parameters
+
+_FEW: Final = 16
+"""Counts up to which a sum over counts is taken one by one."""
+_NODES: Final = np.polynomial.legendre.leggauss(24)
+
+
+def poisson_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a Poisson distribution."""
+    return ((value - p["rate"]) / jnp.sqrt(p["rate"]))[None]
+
+
+def poisson_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a Poisson distribution."""
+    return (t["rate"] / jnp.sqrt(p["rate"]))[None]
+
+
+def counts_deviation(p: Parameters) -> jax.Array:
+    """Standard deviation of a count whose rate is gamma distributed."""
+    return jnp.sqrt(p["concentration"] * (1 + p["rate"])) / p["rate"]
+
+
+def counts_spread(p: Parameters) -> jax.Array:
+    """Root of the information on the concentration c where the mean m is held.
+
+    It is E[psi'(c) - psi'(c + Y)] - m / (c (c + m)), the expectation the sum over k of P(Y > k) / (c + k)^2. The first k
+    are taken one by one, then those that Y surely exceeds together, then those around its mean by quadrature.
+    """
+    c, success = p["concentration"][..., None], 1 / (1 + p["rate"][..., None])
+    mean, deviation = c / p["rate"][..., None], counts_deviation(p)[..., None]
+    start = _FEW - 0.5
+    low = jnp.maximum(start, mean * jnp.exp(-8 * deviation / mean))
+    log_low, log_high = jnp.log(low), jnp.log(jnp.maximum(low, mean + 12 * deviation) + 0.5)
+    many = jnp.exp(log_low + (log_high - log_low) * (1 + _NODES[0]) / 2)
+    width = many * (log_high - log_low) * _NODES[1] / 2
+    few = jnp.broadcast_to(jnp.arange(_FEW, dtype=c.dtype), (*many.shape[:-1], _FEW))
+    at = jnp.concatenate([few, many], axis=-1)
+    weight = jnp.concatenate([jnp.ones_like(few), width], axis=-1)
+    beyond = betainc(at + 1, jnp.broadcast_to(c, at.shape), jnp.broadcast_to(success, at.shape))
+    whole = jnp.sum(weight * beyond / (c + at) ** 2, axis=-1, keepdims=True)
+    whole = whole + 1 / (c + start) - 1 / (c + low)
+    information = jnp.maximum(whole - mean / (c * (c + mean)), jnp.finfo(whole.dtype).eps * whole)
+    return jnp.sqrt(information)[..., 0]
+
+
+def counts_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a negative binomial distribution, a Poisson one whose rate is gamma distributed."""
+    c, mean = p["concentration"], p["concentration"] / p["rate"]
+    more = (value - mean) / (c + mean)
+    spread = digamma(value + c) - digamma(c) - jnp.log1p(mean / c) - more
+    return jnp.stack([(value - mean) / counts_deviation(p), spread / counts_spread(p)])
+
+
+def counts_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a negative binomial distribution."""
+    mean = (t["concentration"] - t["rate"] * p["concentration"] / p["rate"]) / p["rate"]
+    return jnp.stack([mean / counts_deviation(p), t["concentration"] * counts_spread(p)])
+
+
+def bernoulli_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a Bernoulli or binomial distribution of logits; finite where the probability rounds to zero or one.
+
+    Nothing was tried where a binomial's count is zero, and nothing is said.
+    """
+    n, half = p.get("total_count", jnp.ones(())), p["logits"] / 2
+    yes = jnp.where(value > 0, value * jnp.exp(-half), 0.0)
+    no = jnp.where(value < n, (n - value) * jnp.exp(half), 0.0)
+    return ((yes - no) / jnp.sqrt(jnp.maximum(n, 1.0)))[None]
+
+
+def logits_deviation(p: Parameters) -> jax.Array:
+    """Standard deviation of the number of successes."""
+    n = p.get("total_count", jnp.ones(()))
+    return jnp.sqrt(n * jax.nn.sigmoid(p["logits"]) * jax.nn.sigmoid(-p["logits"]))
+
+
+def bernoulli_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a Bernoulli or binomial distribution of logits."""
+    return (t["logits"] * logits_deviation(p))[None]
+
+
+def probs_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a Bernoulli or binomial distribution of probabilities."""
+    n = p.get("total_count", jnp.ones(()))
+    return ((value - n * p["probs"]) / jnp.sqrt(jnp.maximum(n, 1.0) * p["probs"] * (1 - p["probs"])))[None]
+
+
+def probs_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a Bernoulli or binomial distribution of probabilities."""
+    n = p.get("total_count", jnp.ones(()))
+    return (t["probs"] * jnp.sqrt(n / (p["probs"] * (1 - p["probs"]))))[None]
+
+
+def _probability(p: Parameters) -> jax.Array:
+    return p["probs"] if "probs" in p else jax.nn.softmax(p["logits"])
+
+
+def categorical_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """One row for each outcome; together they sum to zero along the roots of the probabilities."""
+    probability = _probability(p)
+    one_hot = jax.nn.one_hot(value, probability.shape[-1], dtype=probability.dtype)
+    return jnp.moveaxis((one_hot - probability) / jnp.sqrt(jnp.maximum(probability, 1e-30)), -1, 0)
+
+
+def categorical_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a categorical distribution."""
+    probability = _probability(p)
+    if "logits" in t:
+        mean = jnp.sum(probability * t["logits"], axis=-1, keepdims=True)
+        return jnp.moveaxis(jnp.sqrt(probability) * (t["logits"] - mean), -1, 0)
+    return jnp.moveaxis(t["probs"] / jnp.sqrt(jnp.maximum(probability, 1e-30)), -1, 0)

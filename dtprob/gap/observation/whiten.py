@@ -1,0 +1,129 @@
+"""Scores of an observed distribution as linear regression rows.
+
+For each observation the gradient of log p in the distribution's parameters is turned into residuals e with mean zero and
+unit covariance under the model, and a change of the parameters into the matching whitened shift. With W the whitened
+tangents of the model, scores are W^T e and the Fisher information is W^T W, whatever the distribution.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final
+
+import jax
+import jax.numpy as jnp
+import numpyro.distributions as dist
+
+from dtprob.errors import InputError
+from dtprob.gap.observation.likelihoods import LIKELIHOODS, SAME
+from dtprob.gap.observation.residuals import Parameters
+
+_WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
+"""What changes the shape or the weight of a distribution and not its density."""
+
+
+@dataclass(frozen=True)
+class Observation:
+    """The distribution of an observed site.
+
+    Attributes:
+        family: name of the distribution's class.
+        parameters: each broadcast to the value's shape, those of classes and covariances with an axis more; "mask" is 0
+            where an entry does not count, if any does not.
+    """
+
+    family: str
+    parameters: Parameters
+
+    def masked(self, rows: jax.Array) -> jax.Array:
+        """Rows (..., *value) with zeros where the mask is."""
+        return jnp.where(self.parameters["mask"] > 0, rows, 0.0) if "mask" in self.parameters else rows
+
+
+def observation(fn: Any, value: Any, name: str) -> Observation:
+    """Unwrap the distribution of an observed site.
+
+    Raises:
+        InputError: the diagnosis has no whitening for the distribution.
+    """
+    mask: Any = None
+    while isinstance(fn, _WRAPPERS):
+        if isinstance(fn, dist.MaskedDistribution):
+            own = jnp.asarray(fn._mask)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+            own = own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
+            mask = own if mask is None else mask & own
+        fn = fn.base_dist
+    family = SAME.get(type(fn).__name__, type(fn).__name__)
+    if family not in LIKELIHOODS:
+        raise InputError(
+            f"observed site {name!r}",
+            f"a distribution among {', '.join(LIKELIHOODS)}",
+            family,
+            "Declare the observation with one of these to diagnose its gap.",
+        )
+    shape = jnp.shape(value)
+    parameters = {}
+    known = LIKELIHOODS[family]
+    for parameter in known.parameters:
+        array = jnp.asarray(getattr(fn, parameter))
+        array = array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(float)
+        trailing = array.shape[array.ndim - known.trailing.get(parameter, 0) :]
+        parameters[parameter] = jnp.broadcast_to(array, shape + trailing)
+    if mask is not None:
+        parameters["mask"] = jnp.broadcast_to(jnp.asarray(mask, float), shape)
+    return Observation(family, parameters)
+
+
+def rewritten(observed: Observation, fn: Any, value: Any, name: str) -> Observation:
+    """Unwrap a distribution that was made from `distribution(observed)`, with the mask of the observation itself."""
+    new = observation(fn, value, name)
+    mask = {n: v for n, v in observed.parameters.items() if n == "mask"}
+    return Observation(new.family, {**new.parameters, **mask})
+
+
+def log_prob(observed: Observation, value: jax.Array) -> jax.Array:
+    """Elementwise log density, zero where masked; shape of the value."""
+    elementwise = LIKELIHOODS[observed.family].log_prob
+    if elementwise is not None:
+        return observed.masked(elementwise(observed.parameters, value))
+    return observed.masked(distribution(observed).log_prob(value))
+
+
+def sample(observed: Observation, key: jax.Array) -> jax.Array:
+    """A replicate of the observation."""
+    return distribution(observed).sample(key)
+
+
+def distribution(observed: Observation) -> Any:
+    """The NumPyro distribution, without its mask."""
+    parameters = {n: v for n, v in observed.parameters.items() if n != "mask"}
+    return LIKELIHOODS[observed.family].make(**parameters)
+
+
+def residual(observed: Observation, value: jax.Array) -> jax.Array:
+    """Whitened residuals, shape (component, *shape of the value): zero mean and identity covariance under the model."""
+    return observed.masked(LIKELIHOODS[observed.family].residual(observed.parameters, value))
+
+
+def shift(observed: Observation, tangent: Mapping[str, jax.Array]) -> jax.Array:
+    """Whitened shift of a change of the parameters, shape (component, *shape of the value)."""
+    return observed.masked(LIKELIHOODS[observed.family].shift(observed.parameters, dict(tangent)))
+
+
+def location_rows(family: str, n_rows: int) -> int:
+    """How many of an observation's rows stand for its location or probability rather than its spread."""
+    located = LIKELIHOODS[family].located
+    return n_rows if located is None else located
+
+
+def is_joint(family: str) -> bool:
+    """Whether entries along the last axis are one vector, of which no entry stands alone."""
+    return LIKELIHOODS[family].log_prob is not None
+
+
+def moved(observed: Observation, step: jax.Array, *, spread: bool) -> Observation | None:
+    """The observation with its location, or its spread, moved by whitened steps; None where its family has no such move."""
+    known = LIKELIHOODS[observed.family]
+    move = known.respread if spread else known.relocate
+    return None if move is None else Observation(observed.family, move(observed.parameters, step))

@@ -1,0 +1,1 @@
+"""Where the gap lies: over the model's sites and the data's coordinates."""

@@ -1,0 +1,218 @@
+"""Ways for a perturbation to vary: smoothly along an axis, as a ripple, with a column of the data or a site, by groups."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final, NamedTuple, cast
+
+import equinox as eqx
+import numpy as np
+from scipy import sparse, stats
+
+from dtprob.gap.model.problem import Problem
+from dtprob.models.declaration import is_unnamed
+
+_SMOOTH_FROM: Final = 6
+_ORDER: Final = 4
+"""Half waves of what counts as smooth."""
+_FINEST: Final = 512
+"""Half waves of the finest ripple that is looked for."""
+_CROSSED: Final = 3
+"""Half waves along each of two columns of what varies over both."""
+_MOST_PAIRS: Final = 6
+_LONGEST: Final = 24
+"""Period of the longest cycle that is looked for; longer ones show as ripples."""
+_LARGEST: Final = 1 << 18
+"""Numbers that the curves over one quantity may take in a band."""
+_FINEST_OVER: Final = 64
+"""Half waves of the finest ripple over a quantity of several axes or a site."""
+_TURNS: Final = 24
+"""Times that a cycle has to come round: sums of a few entries are far from normal."""
+
+
+class Ripple(NamedTuple):
+    """What a band of ripples is along.
+
+    Attributes:
+        over: an axis or a column.
+        lowest: half waves of the first curve; each of the next has one more.
+    """
+
+    over: str
+    lowest: int
+
+
+@dataclass(frozen=True)
+class Curves:
+    """Ways to vary along an axis, each with a weight of its own.
+
+    Attributes:
+        label: how, in words.
+        values: (weight, position).
+        ripple: of a band of ripples, what they are along.
+        column: of groups of positions, the column of the data that makes them.
+    """
+
+    label: str
+    values: np.ndarray | sparse.csr_matrix
+    ripple: Ripple | None = None
+    column: str | None = None
+
+    @property
+    def extent(self) -> tuple[int, int]:
+        """How many weights there are, and along how many positions they run."""
+        weights, size = cast("tuple[int, int]", self.values.shape)
+        return weights, size
+
+    def band(self, first: int, stop: int) -> Curves:
+        """The curves of a ripple from one to another, that one left out.
+
+        Raises:
+            ValueError: these are no ripples.
+        """
+        if self.ripple is None:
+            raise ValueError(f"{self.label} is no ripple, and has no bands")
+        return _ripple(self.ripple.over, self.ripple.lowest + first, np.asarray(self.values[first:stop]))
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What the model computes or the data tell at positions of some axes, over which a perturbation may vary.
+
+    Attributes:
+        name: the site or the column.
+        axes: along which it varies.
+        values: at their positions.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    values: np.ndarray
+
+    def kept(self, axes: Sequence[str], shape: Sequence[int]) -> tuple[int, ...] | None:
+        """Which of a site's axes are this one's; None where it lies on others."""
+        agree = all(a == b or is_unnamed(a) or is_unnamed(b) for a, b in zip(self.axes, axes, strict=False))
+        if agree and self.values.shape == tuple(shape):
+            return tuple(range(len(shape)))
+        place = [axes.index(axis) for axis in self.axes if axis in axes]
+        whole = len(place) == len(self.axes) and place == sorted(place)
+        return tuple(place) if whole and self.values.shape == tuple(shape[i] for i in place) else None
+
+    def curves(self) -> Iterator[Curves]:
+        """Smooth, and ripples over its values."""
+        flat = self.values.reshape(-1)
+        if _ORDER * flat.size > _LARGEST:
+            return
+        yield from _over(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
+
+
+def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | None:
+    """A real site or column, on the axes along which it varies; None where too few of its values differ."""
+    if not np.issubdtype(values.dtype, np.floating) or not np.isfinite(values).all():
+        return None
+    wide = [i for i, n in enumerate(values.shape) if n > 1 and (values != values.take([0], i)).any()]
+    values = values[tuple(slice(None) if i in wide else 0 for i in range(values.ndim))]
+    if len(np.unique(values)) < _SMOOTH_FROM:
+        return None
+    return Quantity(name, tuple(axes[i] for i in wide), values)
+
+
+def curves(problem: Problem, axis: str, size: int) -> tuple[Curves, ...]:
+    """All curves along an axis of some positions, each label once; none where the axis is short."""
+    if size < _SMOOTH_FROM:
+        return ()
+    # ripples over a column of the axis's name are those over its positions, at their true places
+    return tuple({found.label: found for found in _curves(problem, axis, size)}.values())
+
+
+def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
+    place = (np.arange(size) + 0.5) / size
+    yield Curves(f"smooth in {axis}", _waves(place, 1, _ORDER))
+    yield from _ripples(axis, place, _FINEST)
+    columns = _columns(problem, axis, size)
+    for name, column in columns.items():
+        groups, index = np.unique(column, return_inverse=True)
+        if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
+            yield from _over(name, column, _FINEST)
+        else:
+            grouped = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
+            yield Curves(f"by {name}", grouped, column=name)
+    smooth = [name for name, column in columns.items() if np.issubdtype(column.dtype, np.floating)]
+    for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
+        crossed = _waves(_rank(columns[one]), 1, _CROSSED), _waves(_rank(columns[other]), 1, _CROSSED)
+        products = crossed[0][:, None] * crossed[1][None]
+        yield Curves(f"over {one} and {other}", products.reshape(-1, size))
+
+
+def cycles(size: int, over: str) -> tuple[Curves, ...]:
+    """For each period, the phases at which something may repeat along axes of some positions; none where they are short."""
+    place = np.arange(size)
+    return tuple(
+        Curves(f"every {period} along {over}", sparse.csr_matrix((np.ones(size), (place % period, place))))
+        for period in range(2, min(_LONGEST, size // _TURNS) + 1)
+    )
+
+
+def _over(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
+    """Smooth over a column (size,), and ripples over its values."""
+    yield Curves(f"along {name}", _smooth(column))
+    yield from _ripples(name, (column - column.min()) / np.ptp(column), finest)
+
+
+def _ripples(over: str, place: np.ndarray, finest: int) -> Iterator[Curves]:
+    """Octaves of ripples over places (size,) in (0, 1)."""
+    low, finest = _ORDER + 1, min(len(place) - 1, finest)
+    while low <= finest:
+        high = min(2 * (low - 1), finest)
+        yield _ripple(over, low, _waves(place, low, high))
+        low = high + 1
+
+
+def _ripple(over: str, low: int, values: np.ndarray) -> Curves:
+    """Ripples of `low` half waves and more, one after another."""
+    label = f"ripple in {over}, {low} to {low + len(values) - 1} half waves"
+    return Curves(label, values, ripple=Ripple(over, low))
+
+
+def _waves(place: np.ndarray, low: int, high: int) -> np.ndarray:
+    """Cosines of low to high half waves over places (size,) in (0, 1)."""
+    return np.cos(np.pi * np.outer(np.arange(low, high + 1), place))
+
+
+def _smooth(column: np.ndarray) -> np.ndarray:
+    """Cosines of few half waves over the ranks (size,), and a line over the values: far ones have leverage.
+
+    The line may cross zero anywhere, so a constant is there too: not every model has a level of its own.
+    """
+    line = (column - column.mean()) / (2**0.5 * column.std())
+    return np.concatenate([_waves(_rank(column), 1, _ORDER), line[None], np.full_like(line, 0.5**0.5)[None]])
+
+
+def _rank(column: np.ndarray) -> np.ndarray:
+    """Ranks (size,) in (0, 1), so that a few far values do not bend the curves."""
+    return (stats.rankdata(column) - 0.5) / len(column)
+
+
+def _columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
+    """Columns of the data (size,) that lie along an axis of the observations and vary; of positions each coordinate."""
+    observed = problem.declaration.observed.values()
+    if not any(axis in site.axes for site in observed):
+        return {}
+    arguments = {site.argument for site in observed}
+    found: dict[str, np.ndarray] = {}
+    for name, values in problem.data.items():
+        if name in arguments or not eqx.is_array_like(values):
+            continue
+        column = np.asarray(values)
+        if column.shape == (size,):
+            found[name] = column
+        elif column.ndim == 2 and column.shape[0] == size and column.shape[1] <= 3:
+            found |= {f"{name}[{i}]": part for i, part in enumerate(column.T)}
+    real = (np.floating, np.integer, np.bool_)
+    return {
+        name: column
+        for name, column in found.items()
+        if any(np.issubdtype(column.dtype, kind) for kind in real) and len(np.unique(column)) > 1
+    }

@@ -1,0 +1,173 @@
+"""Where the gap lies: over the model's sites and over the data's coordinates, each map with family-wise control.
+
+Sites are the model's deterministic ones and the spreads of what is observed. One gradient per bootstrap replicate serves
+all families of all sites.
+"""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Final, NamedTuple
+
+import equinox as eqx
+import numpy as np
+
+from dtprob.gap.fitting.bootstrap import Replicates, more
+from dtprob.gap.fitting.fit import Fit
+from dtprob.gap.fitting.projection import Projection
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.gap.tails import family_wise
+from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
+from dtprob.gap.where.curves import Quantity, curves, quantity
+from dtprob.gap.where.families import Site, deterministic, families, observed, shifted
+from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
+from dtprob.gap.where.suspects import Suspect, suspects
+
+_SURE: Final = 0.005
+"""Probability below which a site is surely wrong."""
+_CLEAR: Final = (1e-9, 0.1)
+"""Between these, a first look at the sites does not tell on which side of the level a gap lies."""
+
+
+@dataclass(frozen=True)
+class SiteFinding:
+    """Evidence that a site's values are wrong.
+
+    Attributes:
+        site: its name.
+        family: what is added ("additive", "relative", "conjugate", "spread", ...) and how it varies.
+        p_value: family-wise over all sites and families.
+        gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order.
+        last: whether it is the spread of an observation where another site is surely wrong: a wrong mean spreads too.
+    """
+
+    site: str
+    family: str
+    p_value: float
+    gain: float
+    last: bool = False
+
+
+@dataclass(frozen=True)
+class Location:
+    """Maps of the gap at one fit; the suspects come in order of falling evidence.
+
+    `entries` holds, for sites of several axes, the nats above chance that a factor of its own would gain at each entry.
+    """
+
+    sites: tuple[SiteFinding, ...]
+    coordinates: tuple[CoordinateFinding, ...]
+    axes: dict[str, np.ndarray]
+    site_p_value: float
+    suspects: tuple[Suspect, ...] = ()
+    entries: Mapping[str, np.ndarray] = MappingProxyType({})
+
+
+def locate(
+    problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, settings: Settings
+) -> Location:
+    """Test every site family and every block of coordinates at a fit."""
+    blocks, maps = scan_coordinates(problem, drawn)
+    seen = _test_sites(problem, fitted, projection, drawn)
+    if _CLEAR[0] < seen.p_value < _CLEAR[1] and (further := more(drawn, settings.site_times)) is not None:
+        seen = _test_sites(problem, fitted, projection, further)
+    sure = {f.site for f in seen.findings if f.p_value <= _SURE}
+    named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
+    suspected = tuple(sorted(named, key=lambda s: -s.evidence))
+    entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
+    ordered = tuple(sorted(_spreads_last(seen.findings), key=lambda f: (f.last, f.p_value, -f.gain)))
+    return Location(ordered, blocks, maps, seen.p_value, suspected, entries)
+
+
+class _Tested(NamedTuple):
+    """Every site with the tests of its families, and what they say."""
+
+    tested: list[tuple[Site, list[FamilyTest]]]
+    findings: list[SiteFinding]
+
+    @property
+    def p_value(self) -> float:
+        """Family-wise over all sites."""
+        return min((f.p_value for f in self.findings), default=1.0)
+
+
+def _test_sites(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> _Tested:
+    at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
+    axes = {name: site.axes for name, site in problem.declaration.sites.items()}
+    found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
+    found += observed(problem, np.concatenate([drawn.observed[None], drawn.projected]))
+    along = functools.cache(functools.partial(curves, problem))  # sites share their axes
+    over = [(q, tuple(q.curves())) for q in _quantities(problem, found)]
+    tested = [(site, [family_test(*family) for family in families(along, over, site)]) for site in found]
+    null = [test.null for _, tests in tested for test in tests]
+    smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
+    findings = [
+        _finding(problem, fitted, projection, drawn, site=site, tests=tests, smallest=smallest)
+        for site, tests in tested
+    ]
+    return _Tested(tested, findings)
+
+
+def _quantities(problem: Problem, sites: Sequence[Site]) -> Iterator[Quantity]:
+    """What the model computes and the data tell along several axes: a perturbation may vary over it."""
+    arguments = {site.argument for site in problem.declaration.observed.values()}
+    columns = {
+        name: (site.axes, np.asarray(values))
+        for name, values in problem.data.items()
+        for site in problem.declaration.observed.values()
+        if name not in arguments
+        and eqx.is_array_like(values)
+        and np.ndim(values) > 1
+        and np.shape(values) == site.shape
+    }
+    computed = {site.name: (site.axes, site.value) for site in sites if site.rows is None}
+    for name, (axes, values) in (columns | computed).items():
+        if (found := quantity(name, axes, values)) is not None:
+            yield found
+
+
+def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
+    """The map over the entries of a site of several axes."""
+    wide = tuple(i for i, n in enumerate(site.value.shape) if n > 1)
+    for test in tests if len(wide) > 1 else ():
+        if (
+            test.family.kind == "relative"
+            and test.family.pattern.kept == wide
+            and test.family.pattern.curves is None
+        ):
+            seen = test.variance > 1e-12 * max(float(test.variance.max(initial=0.0)), 1e-300)
+            gain = np.where(seen, 0.5 * (test.first[0] ** 2 / np.where(seen, test.variance, 1.0) - 1), 0.0)
+            yield gain.reshape(*site.value.shape, -1).sum(-1)
+
+
+def _spreads_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
+    spread = [f.family.startswith("spread") for f in findings]
+    sure = any(f.p_value <= _SURE and not s for f, s in zip(findings, spread, strict=True))
+    return [replace(f, last=sure and s) for f, s in zip(findings, spread, strict=True)]
+
+
+def _finding(
+    problem: Problem,
+    fitted: Fit,
+    projection: Projection,
+    drawn: Replicates,
+    *,
+    site: Site,
+    tests: Sequence[FamilyTest],
+    smallest: np.ndarray,
+) -> SiteFinding:
+    """The family of a site with the smallest p-value, with the gain along its steepest direction."""
+    best = min(tests, key=lambda test: (test.p_value, -float((test.first[0] ** 2).sum())))
+    steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
+    shifts = projection.rows(shifted(problem, fitted.x, site, steps))
+    rows = np.concatenate([drawn.observed[None], drawn.projected[:CHANCE]])
+    slope = np.einsum("ncm,ncm->n", shifts, rows)
+    curvature = np.einsum("ncm,ncm->n", shifts, shifts)
+    gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)
+    net = max(float(gain[0] - gain[1:].mean()), 0.0)
+    p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
+    return SiteFinding(site.name, best.family.label, p_value, net)

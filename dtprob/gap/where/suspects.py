@@ -1,0 +1,78 @@
+"""How a site that is surely wrong may vary: the families that bring evidence as random weights of a common spread."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from dtprob.gap.where.families import Family, Site
+from dtprob.gap.where.family_test import FamilyTest
+from dtprob.gap.which.fields import common_spread, spread_terms
+
+_MOST_SUSPECTS: Final = 12
+_MOST_WEIGHTS: Final = 4096
+"""Suspects of a site that are kept, and weights that one of them may have."""
+
+
+@dataclass(frozen=True)
+class Suspect:
+    """A way of varying a surely wrong site, with random weights of a common spread.
+
+    Attributes:
+        site: its name.
+        rows: of an observation, its whitened components that move; None for a deterministic site.
+        family: what is added to the site, and how it varies.
+        spread: standard deviation of the weights with the largest evidence.
+        evidence: log Bayes factor of that spread against none, to first order, each weight apart.
+    """
+
+    site: str
+    rows: tuple[int, ...] | None
+    family: Family
+    spread: float
+    evidence: float
+
+
+def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
+    """The families of a site that have the most evidence, ripples also narrowed to the half waves that bring it."""
+    whole = [test for test in tests if test.variance.size <= _MOST_WEIGHTS]
+    found = [_suspect(site, test) for test in whole]
+    found += [_suspect(site, narrow, price) for test in whole for narrow, price in _narrowed(test)]
+    return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
+
+
+def _narrowed(test: FamilyTest) -> Iterator[tuple[FamilyTest, float]]:
+    """The ripple's band of 1, 2, 4 ... half waves with the most evidence, and the logarithm of how many there were."""
+    pattern = test.family.pattern
+    if pattern.curves is None or pattern.curves.ripple is None:
+        return
+    count, _ = pattern.curves.extent
+    if count == 1:
+        return
+    _, terms = spread_terms(test.first[0], test.variance)
+    summed = np.cumsum(terms.reshape(len(terms), count, -1).sum(-1), axis=1)
+    summed = np.concatenate([np.zeros((len(terms), 1)), summed], axis=1)
+    lengths = 2 ** np.arange(int(np.log2(count)))
+    tops = [(summed[:, n:] - summed[:, :-n]).max(axis=0) for n in lengths]
+    top = max(range(len(tops)), key=lambda i: tops[i].max())
+    first = int(tops[top].argmax())
+    best = first, first + int(lengths[top])
+    band = pattern.curves.band(*best)
+    narrow = replace(test.family, pattern=replace(pattern, label=band.label, curves=band))
+    parts = len(test.variance) // count
+    own = slice(best[0] * parts, best[1] * parts)
+    chances = sum(map(len, tops))
+    yield (
+        test._replace(family=narrow, first=test.first[:, own], variance=test.variance[own]),
+        float(np.log(chances)),
+    )
+
+
+def _suspect(site: Site, test: FamilyTest, price: float = 0.0) -> Suspect | None:
+    """A tested family as a suspect, if its evidence less its price speaks for it."""
+    spread, evidence = common_spread(test.first[0], test.variance)
+    evidence -= price
+    return Suspect(site.name, site.rows, test.family, spread, evidence) if evidence > 0 else None

@@ -1,0 +1,125 @@
+"""Confirmation of the accepted causes by a real engine: the posterior of the extended model."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import fields, replace
+from typing import Any
+
+import jax
+import numpy as np
+
+from dtprob.effects.effect import Effect, Parameter, with_effects
+from dtprob.gap.diagnosis import Size
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.informed import informed
+from dtprob.gap.fitting.plausible import nulls, scales, sides
+from dtprob.gap.model.problem import Problem
+from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
+from dtprob.inference.laplace import Laplace
+
+_DIRECTIONS = ("x", "y", "z")
+_Z90 = 1.6449
+
+
+def confirm(
+    problem: Problem, fitted: fitting.Fit, effects: Sequence[Effect], key: jax.Array, engine: AbstractEngine
+) -> tuple[tuple[Size, ...], bool]:
+    """Posterior sizes of the accepted effects, and whether their priors call them plausible.
+
+    Effects with parameters of their own go through `engine` on the extended model, started at the refit; the standard
+    deviation of a variance effect comes from the refit, where its field is integrated out.
+    """
+    means = [e for e in effects if e.kind == "mean"]
+    sizes: list[Size] = []
+    if means:
+        posterior = _posterior(problem, fitted, means, key, engine)
+        for effect in means:
+            for parameter in effect.parameters:
+                draws = posterior[effect.site_name(parameter.name)]
+                sizes += _sizes(
+                    parameter, draws.reshape(-1, *parameter.shape), prefix=_prefix(effect, effects)
+                )
+    for effect in effects:
+        if effect.kind == "variance":
+            sizes.append(_spread(problem, fitted, effect, prefix=_prefix(effect, effects)))
+    return tuple(sizes), all(_plausible(e, fitted, problem) for e in effects)
+
+
+def _posterior(
+    problem: Problem, fitted: fitting.Fit, means: Sequence[Effect], key: jax.Array, engine: AbstractEngine
+) -> dict[str, np.ndarray]:
+    """Draws of the effects' parameters by site: of the engine, or of the refit's own normal approximation.
+
+    The refit is a mode with its curvature, so for `Laplace` there is nothing to run again.
+    """
+    if isinstance(engine, Laplace):
+        position = {int(i): j for j, i in enumerate(fitted.global_index)}
+        noise = np.asarray(jax.random.normal(key, (engine.draws, len(fitted.global_index))))
+        moved = fitted.x[fitted.global_index] + noise @ np.linalg.cholesky(fitted.covariance).T
+        moved = np.maximum(moved, _lowest(problem, means, fitted))
+        names = [e.site_name(p.name) for e in means for p in e.parameters]
+        return {n: moved[:, [position[int(i)] for i in problem.layout[n].index[0]]] for n in names}
+    started = _start_at(engine, problem.initial(fitted.x, means))
+    model = with_effects(informed(problem.model, problem.known), means)
+    posterior = started(key, model, problem.data, options=LATENTS_ONLY)
+    return {name: np.asarray(draws) for name, draws in posterior.draws.items()}
+
+
+def _lowest(problem: Problem, means: Sequence[Effect], fitted: fitting.Fit) -> np.ndarray:
+    """The smallest value of each global coordinate: the null of one-sided parameters."""
+    lowest = np.full(problem.dimension, -np.inf)
+    for effect in means:
+        index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+        lowest[index] = np.where(sides(effect), nulls(effect), -np.inf)
+    return lowest[fitted.global_index]
+
+
+def _start_at(engine: AbstractEngine, initial: Mapping[str, Any]) -> AbstractEngine:
+    """The engine, started at given values where it can be."""
+    settings = {f.name for f in fields(engine)}  # pyright: ignore[reportArgumentType]
+    changes: dict[str, Any] = {"initial": initial} if "initial" in settings else {}
+    if "starts" in settings:
+        changes["starts"] = 1
+    return replace(engine, **changes) if changes else engine  # pyright: ignore[reportArgumentType]
+
+
+def _prefix(effect: Effect, effects: Sequence[Effect]) -> str:
+    return "" if len(effects) == 1 else f"{effect.name}."
+
+
+def _sizes(parameter: Parameter, draws: np.ndarray, prefix: str) -> list[Size]:
+    flat = draws.reshape(len(draws), -1)
+    labels = [""] if flat.shape[1] == 1 else [f"_{label}" for label in _labels(parameter.shape)]
+    result = []
+    for j, label in enumerate(labels):
+        low, high = np.quantile(flat[:, j], [0.05, 0.95])
+        name = f"{prefix}{parameter.name}{label}{_suffix(parameter.unit)}"
+        result.append(Size(name, float(flat[:, j].mean()), float(low), float(high), parameter.unit))
+    return result
+
+
+def _labels(shape: tuple[int, ...]) -> list[str]:
+    if shape == (3,):
+        return list(_DIRECTIONS)
+    return ["_".join(map(str, index)) for index in np.ndindex(*shape)]
+
+
+def _suffix(unit: str) -> str:
+    """The unit as the end of a key, as in `delay_s`; nothing for a pure number."""
+    return "" if unit == "1" else "_" + unit.replace("/", "_per_").replace("^", "").replace(" ", "_")
+
+
+def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) -> Size:
+    sd, parameter = fitted.spread[effect.name], effect.parameters[0]
+    n = sum(block.index.size for block in problem.blocks_of(effect.name))
+    half = _Z90 * sd / np.sqrt(2 * max(n, 1))
+    name = f"{prefix}{parameter.name}{_suffix(parameter.unit)}"
+    return Size(name, sd, max(sd - half, 0.0), sd + half, parameter.unit)
+
+
+def _plausible(effect: Effect, fitted: fitting.Fit, problem: Problem) -> bool:
+    if effect.kind == "variance":
+        return fitted.spread[effect.name] <= 4 * float(scales(effect).max())
+    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    return bool(np.all(np.abs(fitted.x[index] - nulls(effect)) <= 4 * scales(effect)))

@@ -1,0 +1,139 @@
+"""Candidates that first-order scores cannot see: effects that turn phases by radians at plausible sizes.
+
+Every effect is tried at four sizes; where the log likelihood is not the parabola that its first two sizes promise, the
+effect is scanned over its whole plausible range. The rewritten sites go through the base model as perturbations, so no
+candidate needs a compilation of its own.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+
+from dtprob.effects.effect import Effect
+from dtprob.gap.fitting.plausible import nulls, scales, sides
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.which.directions import Surroundings, surroundings
+
+_REACH = 2.5
+_COARSE, _FINE = 32, 160
+_WAVES = 3
+_SCANNED = 2
+_SMALL, _LARGE = 0.02, 1.0
+_BENT = 0.4
+_DRAWS = 64
+_STEPS = 21
+
+
+@dataclass(frozen=True)
+class Found:
+    """The best size of an effect along its plausible range: gain in log likelihood there, nuisances, flat parameters."""
+
+    gain: float
+    x: np.ndarray
+    parameters: np.ndarray
+
+
+def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Found]:
+    """Effects that bend the log likelihood, each at its best plausible size.
+
+    The nuisances stand once at the fit and once at the centre of their prior: a fit without the effect may have silenced
+    the very part of the model that the effect acts on.
+
+    Args:
+        problem: the model and candidates on their data.
+        x: the fit.
+        names: candidates to look at.
+    """
+    means = [e for e in problem.effects if e.kind == "mean" and e.rewrites and e.name in names]
+    small = {e.name: _lines(e, np.array([_SMALL, 2 * _SMALL, _LARGE, -_LARGE])) for e in means}
+    found: dict[str, Found] = {}
+    for anchor in (x, centre(problem, x)):
+        around = surroundings(problem, anchor)
+        here = float(problem.compiled.shifted_likelihood(anchor, {}, 1)[0])
+        probed = _likelihoods(problem, around, small)
+        bent = [e for e in means if _is_bent(probed[e.name] - here)]
+        lines, likelihoods = _scanned(problem, around, bent, _COARSE)
+        waves = [e for e in bent if _is_wave(likelihoods[e.name])]
+        for part, values in zip(_scanned(problem, around, waves, _FINE), (lines, likelihoods), strict=True):
+            values.update(part)
+        for name, values in likelihoods.items():
+            best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
+            gain = float(values[best]) - here
+            if name not in found or gain > found[name].gain:
+                found[name] = Found(gain, anchor, lines[name][best])
+    return found
+
+
+def centre(problem: Problem, x: np.ndarray) -> np.ndarray:
+    """Base nuisances at the centre of their prior, but for the one whose move back to the fit matters most (the noise)."""
+    draws = problem.prior_draws(jax.random.key(0), _DRAWS)
+    result = x.copy()
+    blocks = [b for b in problem.blocks_of(None) if not b.local]
+    for block in blocks:
+        result[block.index[0]] = np.median(draws[:, block.index[0]], axis=0)
+    trials = []
+    for block in blocks:
+        for position in block.index[0]:
+            for value in np.quantile(draws[:, position], np.linspace(0.02, 0.98, _STEPS)):
+                moved = result.copy()
+                moved[position] = value
+                trials.append(moved)
+            moved = result.copy()
+            moved[position] = x[position]
+            trials.append(moved)
+    values = problem.compiled.profile(np.stack([result, *trials]))
+    best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
+    return result if best == 0 else trials[best - 1]
+
+
+def _scanned(
+    problem: Problem, around: Surroundings, effects: Sequence[Effect], count: int
+) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Flat parameters along each effect's plausible range, and the log likelihoods there."""
+    lines = {e.name: _lines(e, np.linspace(-_REACH, _REACH, count)) for e in effects}
+    return lines, _likelihoods(problem, around, lines)
+
+
+def _is_wave(values: np.ndarray) -> bool:
+    """Whether a coarse line has so many peaks that it may miss some."""
+    lines = values.reshape(-1, _COARSE)
+    inner = lines[:, 1:-1]
+    return bool(np.max(np.sum((inner > lines[:, :-2]) & (inner >= lines[:, 2:]), axis=1)) >= _WAVES)
+
+
+def _lines(effect: Effect, offsets: np.ndarray) -> np.ndarray:
+    """Flat parameters (trial, parameter): each of the first few moved by offsets, in prior standard deviations."""
+    null, scale, sided = nulls(effect), scales(effect), sides(effect)
+    lines = []
+    for j in range(min(len(null), _SCANNED)):
+        line = np.repeat(null[None], len(offsets), axis=0)
+        line[:, j] += (np.abs(offsets) if sided[j] else offsets) * scale[j]
+        lines.append(line)
+    return np.concatenate(lines)
+
+
+def _likelihoods(
+    problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]
+) -> dict[str, np.ndarray]:
+    found = {name: np.full(len(rows), -np.inf) for name, rows in sizes.items()}
+    for name, part, shifts in problem.programs.trial_shifts(around.grown(), sizes):
+        count = part.stop - part.start
+        found[name][part] = problem.compiled.shifted_likelihood(around.x, shifts, count)
+    return found
+
+
+def _is_bent(change: np.ndarray) -> bool:
+    """Whether the change of log likelihood at a large size is not what two small sizes promise, on any line."""
+    for one, two, plus, minus in change.reshape(-1, 4):
+        curvature = (two - 2 * one) / (2 * _SMALL**2)
+        slope = one / _SMALL - curvature * _SMALL
+        promised = np.array([slope * _LARGE + curvature * _LARGE**2, -slope * _LARGE + curvature * _LARGE**2])
+        if not np.all(np.isfinite([plus, minus])):
+            return True
+        if np.max(np.abs(promised - [plus, minus])) > _BENT * np.max(np.abs([plus, minus])) + 1.0:
+            return True
+    return False

@@ -1,0 +1,265 @@
+"""Which effect: nuisance-adjusted scores of all candidates at once, with a bootstrapped family-wise threshold.
+
+Source: Neyman's C(alpha) score, u = sum_i (s_i - B r_i) with variance J = I_ee - B I_te (Bera & Yoon 1993); variance
+effects by the second-order score of a random field (one-sided); significance by the parametric bootstrap of the smallest
+p-value over all candidates (Westfall & Young's min-p).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import numpy as np
+from scipy import stats
+
+from dtprob.effects.effect import Effect
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.active import activate
+from dtprob.gap.fitting.bootstrap import Replicates
+from dtprob.gap.fitting.plausible import log_bayes_factor, scales
+from dtprob.gap.fitting.projection import Projection
+from dtprob.gap.fitting.soundness import UNSEEN
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.gap.tails import (
+    LOG_SMALLEST,
+    family_wise,
+    log_gamma_tail,
+    normal_quantile,
+)
+from dtprob.gap.which.directions import Tangents, surroundings, tangents
+from dtprob.gap.which.fields import field_tests
+from dtprob.gap.which.pairs import Pair, best_pairs
+
+_ABSORBED = 0.98
+_SEEN = 25.0
+_NOTHING = 1e-9
+
+
+@dataclass(frozen=True)
+class Screening:
+    """Scores of all candidates at one fit.
+
+    Attributes:
+        names: the candidates.
+        z: signed scores for one parameter, otherwise the normal quantile of the chi-square p-value.
+        p_value: of each candidate alone.
+        adjusted: family-wise p-value over all candidates.
+        log_bayes_factor: of adding the candidate, from (u, J) and its prior.
+        step: one-step estimate of each mean effect's parameters, flat.
+        absorbed_by: the nuisance that hides the candidate, if one does.
+        detectable: size along the best-determined direction that would be noticed nine times in ten.
+        correlation: of the candidates' scores after adjustment; aliases are near +-1.
+        replicate_p: smallest p-value over all candidates in each bootstrap replicate.
+        scores: of the mean effects among them.
+    """
+
+    names: tuple[str, ...]
+    z: np.ndarray
+    p_value: np.ndarray
+    adjusted: np.ndarray
+    log_bayes_factor: np.ndarray
+    step: dict[str, np.ndarray]
+    absorbed_by: tuple[str | None, ...]
+    detectable: np.ndarray
+    correlation: np.ndarray
+    replicate_p: np.ndarray
+    scores: Scores
+
+
+def screen(
+    problem: Problem, fitted: fitting.Fit, projection: Projection, drawn: Replicates, settings: Settings
+) -> Screening:
+    """Score every candidate that the fit does not already contain."""
+    candidates = [e for e in problem.effects if e.name not in fitted.effects]
+    means = [e for e in candidates if e.kind == "mean"]
+    fields = [e for e in candidates if e.kind == "variance"]
+    around = surroundings(problem, fitted.x)
+    scores = mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
+    energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
+    tested = field_tests(energy, [e.name for e in fields], len(drawn.projected))
+    mean_p, mean_z = _mean_tests(scores, scores.u[None])
+    null_p = _mean_tests(scores, scores.u_null)[0].min(axis=1, initial=1.0)
+    # The fields' replicates are the first of the same data sets.
+    replicate_p = np.minimum(null_p[: len(tested.replicates)], tested.replicates) if fields else null_p
+    smallest = np.concatenate([mean_p[0], tested.smallest])
+    names = [e.name for e in (*means, *fields)]
+    order = np.array([names.index(c.name) for c in candidates], int)
+    log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
+    return Screening(
+        names=tuple(c.name for c in candidates),
+        z=np.concatenate([mean_z[0], tested.z])[order],
+        p_value=np.concatenate([mean_p[0], tested.p_value])[order],
+        adjusted=family_wise(smallest, replicate_p)[order],
+        log_bayes_factor=log_bf[order],
+        step={e.name: scores.step(k) for k, e in enumerate(means)},
+        absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),
+        detectable=np.array([_detectable(scores, c, settings) for c in candidates]),
+        correlation=_correlation(candidates, scores),
+        replicate_p=replicate_p,
+        scores=scores,
+    )
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Adjusted scores of mean effects: u of the data and of the replicates, information, and what was projected away."""
+
+    effects: tuple[Effect, ...]
+    groups: tuple[np.ndarray, ...]
+    u: np.ndarray
+    u_null: np.ndarray
+    information: np.ndarray
+    total: np.ndarray
+    coefficients: np.ndarray
+
+    def part(self, k: int) -> np.ndarray:
+        """Information of one effect's own parameters."""
+        return self.information[np.ix_(self.groups[k], self.groups[k])]
+
+    def root(self, k: int) -> np.ndarray:
+        """Columns that whiten one effect's scores, one per direction that the data can see."""
+        size = np.sqrt(np.maximum(self.total[self.groups[k]], 1e-300))
+        values, vectors = np.linalg.eigh(self.part(k) / np.outer(size, size))
+        keep = values > _NOTHING
+        return vectors[:, keep] / np.sqrt(values[keep]) / size[:, None]
+
+    def step(self, k: int) -> np.ndarray:
+        """One-step estimate of one effect's parameters."""
+        return np.linalg.solve(
+            self.part(k) + np.diag(scales(self.effects[k]) ** -2.0), self.u[self.groups[k]]
+        )
+
+    @property
+    def log_bayes_factor(self) -> np.ndarray:
+        """Of each effect, the scale of its prior mixed; see `dtprob.gap.fitting.plausible`."""
+        return np.array(
+            [
+                log_bayes_factor(
+                    self.part(k),
+                    self.u[group],
+                    scales(self.effects[k]),
+                    one_sided=_is_one_sided(self.effects[k]),
+                )
+                for k, group in enumerate(self.groups)
+            ]
+        )
+
+    def pairs(self) -> tuple[Pair, ...]:
+        """The pairs that explain most together; costly, so made when asked for."""
+        return best_pairs(self.effects, self.groups, self.information, self.u, self.log_bayes_factor)
+
+
+def _is_one_sided(effect: Effect) -> bool:
+    return effect.dimension == 1 and effect.parameters[0].is_one_sided
+
+
+def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, found: Tangents) -> Scores:
+    """Scores of mean effects, of the data and of the replicates.
+
+    Args:
+        problem: the model on its data.
+        projection: at the fit.
+        drawn: the data and replicates at the fit.
+        found: the effects' tangents there.
+    """
+    information, coefficients = projection.information(found.columns)
+    total = np.einsum("cmi,cmi->i", found.columns, found.columns)
+    u = _products(projection.adjoint(drawn.raw), found)
+    values = problem.observed_values
+    for effect, group in zip(found.effects, found.groups, strict=True):
+        for extra in found.extra[effect.name]:
+            own = extra.shift.T @ extra.shift
+            information[np.ix_(group, group)] += own
+            total[group] += np.diag(own)
+            u[group] += extra.score(values[extra.site][None])[0]
+    u_null = np.concatenate([_replicate_scores(projection, found, *portion) for portion in drawn.portions()])
+    information = (information + information.T) / 2
+    return Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
+
+
+def _replicate_scores(
+    projection: Projection, found: Tangents, rows: np.ndarray, values: Mapping[str, jax.Array]
+) -> np.ndarray:
+    """Scores (replicate, column) of mean effects."""
+    u = _products(projection.adjoint(rows), found)
+    for effect, group in zip(found.effects, found.groups, strict=True):
+        for extra in found.extra[effect.name]:
+            u[:, group] += extra.score(values[extra.site])
+    return u
+
+
+def _products(rows: np.ndarray, found: Tangents) -> np.ndarray:
+    """Products (..., column) of rows (..., cluster, row) with the columns of mean effects."""
+    clusters, entries, count = found.columns.shape
+    flat = rows.reshape(*rows.shape[:-2], clusters * entries)
+    return flat @ found.columns.reshape(clusters * entries, count)
+
+
+def _mean_tests(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """p-values and z of score vectors u (n, columns) for each effect, (n, effect)."""
+    p, z = np.ones((len(u), len(scores.effects))), np.zeros((len(u), len(scores.effects)))
+    for k, (effect, group) in enumerate(zip(scores.effects, scores.groups, strict=True)):
+        root = scores.root(k)
+        if not root.shape[1]:
+            continue
+        t = u[:, group] @ root
+        if len(group) == 1:
+            z[:, k] = t[:, 0] * np.sign(root[0, 0])
+            p[:, k] = stats.norm.sf(z[:, k]) if _is_one_sided(effect) else 2 * stats.norm.sf(np.abs(z[:, k]))
+        else:
+            square, d = (t**2).sum(1), root.shape[1]
+            log_p = log_gamma_tail(square / 2, d / 2)
+            p[:, k], z[:, k] = np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
+    return np.maximum(p, 1e-300), z
+
+
+def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Effect) -> str | None:
+    """The nuisance that explains nearly all of an effect's own information."""
+    if effect.kind != "mean":
+        return None
+    k = [e.name for e in scores.effects].index(effect.name)
+    group = scores.groups[k]
+    if scores.total[group].max(initial=0.0) == 0.0:
+        return UNSEEN
+    own = np.diag(scores.part(k))
+    left = own / np.maximum(scores.total[group], 1e-300)
+    if left.max() > 1 - _ABSORBED or (own * scales(scores.effects[k]) ** 2).max() > _SEEN:
+        return None
+    blocks = [b for b in activate(problem, fitted.effects).blocks if not b.local]
+    owners = np.concatenate([[i] * b.size for i, b in enumerate(blocks)]) if blocks else np.zeros(0, int)
+    if not len(owners):
+        return "the clusters' own parameters"
+    share = np.abs(scores.coefficients[:, group]).sum(1)
+    return blocks[int(owners[int(np.argmax(share))])].name
+
+
+def _detectable(scores: Scores, effect: Effect, settings: Settings) -> float:
+    if effect.kind != "mean":
+        return float("nan")
+    k = [e.name for e in scores.effects].index(effect.name)
+    first = scores.groups[k][0]
+    own = float(scores.information[first, first])
+    needed = stats.norm.isf(settings.level / (4 * max(len(scores.effects), 1))) + stats.norm.isf(0.1)
+    return float(needed / np.sqrt(own)) if own > _NOTHING * scores.total[first] else float("inf")
+
+
+def _correlation(candidates: list[Effect], scores: Scores) -> np.ndarray:
+    """Correlation of the candidates' scores, of several parameters the largest canonical one; zero without information."""
+    result = np.eye(len(candidates))
+    roots: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    for k, (effect, group) in enumerate(zip(scores.effects, scores.groups, strict=True)):
+        root = scores.root(k)
+        if root.shape[1]:
+            roots[effect.name] = (group, root)
+    for a, left in enumerate(candidates):
+        for b, right in enumerate(candidates[:a]):
+            if left.name in roots and right.name in roots:
+                (g, u), (h, v) = roots[left.name], roots[right.name]
+                shared = u.T @ scores.information[np.ix_(g, h)] @ v
+                single = shared.size == 1
+                value = float(shared[0, 0]) if single else float(np.linalg.svd(shared, compute_uv=False)[0])
+                result[a, b] = result[b, a] = float(np.clip(value, -1.0, 1.0))
+    return result

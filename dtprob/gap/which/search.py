@@ -1,0 +1,205 @@
+"""Which set of effects: conditional forward steps, each candidate refitted in full, earlier choices looked at again.
+
+First-order scores choose whom to try; the full refit decides, so a large gap, where expansions no longer hold, is judged
+by the model itself. After each accepted effect everything is re-centred at the new fit.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+import jax
+import numpy as np
+
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.refit import at_null_except, refit, starting_points, without
+from dtprob.gap.how_far.remainder import alone
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.gap.view import View, view
+from dtprob.gap.which.trials import Say, Start, Trials, best, credit, tried
+
+_RETURNS: Final = 3
+"""Times that a search may find its starting fit to be no optimum."""
+_REVISIONS: Final = 4
+"""Earlier choices that are looked at again after each step."""
+_NEARLY: Final = 3.0
+"""Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect; by which
+one family of a site has to be better than a random field that stands in for it."""
+_UNDERSTATED: Final = 0.15
+"""Share of a gain that first-order scores may miss."""
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the search: the view of the fit before, the refits that were tried, and the accepted one."""
+
+    view: View
+    trials: Trials
+    accepted: str | None
+
+    @property
+    def end(self) -> Start:
+        """The fit with the effect that was accepted, or the one of the view."""
+        if self.accepted is None:
+            return Start(self.view.problem, self.view.fitted)
+        return Start(self.trials.problem, self.trials.fits[self.accepted])
+
+
+@dataclass(frozen=True)
+class Search:
+    """What a search did.
+
+    Attributes:
+        steps: from the base fit until nothing is significant or worth its prior; the last step accepts nothing.
+        rivals: where the ways ended that were not taken in the end.
+    """
+
+    steps: list[Step]
+    rivals: tuple[Start, ...] = ()
+
+
+def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> Search:
+    """Look for the effects that are missing, one after another; of several ways the one whose end has most credit stands.
+
+    Where a random field was accepted, which can imitate several effects at once, the search goes on without it too. A field
+    alone that one family of a site beats is taken back: it stands in for an effect that is not known. Where a pair promises
+    as much as was reached, the search is started from that pair.
+
+    Args:
+        problem: the model and candidates on their data.
+        base: the fit of the model alone.
+        key: for the bootstrap.
+        settings: level, number of refits and largest set.
+        say: receives one line at each stage.
+    """
+    steps = _forward(problem, base, key, settings, say)
+    end, base = steps[-1].view, steps[0].view.fitted
+    ways = [steps]
+    kinds = {e.name: e.kind for e in problem.effects}
+    field = next((name for name in end.fitted.effects if kinds[name] == "variance"), None)
+    if field is not None:
+        say(f"looking for effects that {field} may have imitated")
+        rest = _refitted_without(end.problem, end.fitted, field)
+        key = jax.random.fold_in(key, 1)
+        others = _forward(end.problem, rest, key, settings, say, base=base, banned=field)
+        ways.append([*steps[:-1], *others])
+    reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
+    pair = _promising(ways, reached - base.log_evidence, settings)
+    if pair is not None:
+        say(f"starting from {pair[0]} and {pair[1]} together")
+        both = _refitted_with(steps[0].view, pair, settings)
+        key = jax.random.fold_in(key, 2)
+        others = _forward(both.problem, both.fitted, key, settings, say, base=base, banned=field)
+        ways.append([*steps[:-1], *others])
+    ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
+    first, bare = ways[0][-1].view.fitted, steps[0].view
+    if first.effects == (field,):
+        say(f"looking whether {field} stands in for what varies more simply at a site")
+        if alone(bare) > credit(problem, first, base) + _NEARLY:
+            ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
+    ends = [way[-1].view for way in ways]
+    return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
+
+
+def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
+    """The pair that promises most to first order, if it promises more than one effect, and as much as was reached.
+
+    None where a way ended with it. First order understates: the base fit's spread holds the gap too.
+    """
+    seen = ways[0][0].view
+    ends = [set(way[-1].view.fitted.effects) for way in ways]
+    if settings.max_effects < 2 or not any(ends):
+        return None
+    pairs = seen.screening.scores.pairs()
+    if not pairs:
+        return None
+    best = pairs[0]
+    alone = float(seen.screening.scores.log_bayes_factor.max())
+    enough = max(alone + np.log(len(seen.problem.effects)) + _NEARLY, (1 - _UNDERSTATED) * reached - _NEARLY)
+    new = not any(set(best.names) <= end for end in ends)
+    return best.names if new and best.log_bayes_factor > enough else None
+
+
+def _refitted_with(seen: View, pair: tuple[str, str], settings: Settings) -> Start:
+    """The base fit with two effects, the second one beside the first and then both together."""
+    problem = seen.problem.with_live(pair)
+    fitted = replace(seen.fitted, x=problem.translate(seen.fitted.x, seen.problem))
+    effects = {e.name: e for e in problem.effects}
+    for name in pair:
+        step = seen.screening.step.get(name) if not fitted.effects else None
+        starts = starting_points(problem, fitted.x, effects[name], step, settings)
+        fitted = refit(problem, fitted, effects[name], starts)
+    return Start(problem, fitted)
+
+
+def _forward(
+    problem: Problem,
+    start: fitting.Fit,
+    key: jax.Array,
+    settings: Settings,
+    say: Say,
+    *,
+    base: fitting.Fit | None = None,
+    banned: str | None = None,
+) -> list[Step]:
+    """Steps from a fit, which may have effects already, each followed by a look at earlier choices."""
+    steps: list[Step] = []
+    fitted, returns = start, 0
+    base = start if base is None else base
+    while True:
+        seen = _looked(problem, fitted, jax.random.fold_in(key, len(steps)), settings, say)
+        little = seen.promise < settings.minor * (fitted.log_evidence - base.log_evidence)
+        if little or len(fitted.effects) == settings.max_effects or not seen.alarmed(settings):
+            return [*steps, Step(seen, Trials(problem, {}), None)]
+        trials = tried(seen, settings, say, banned=banned)
+        problem = trials.problem
+        better = without(problem, seen.fitted, trials.fits, settings.polished) if returns < _RETURNS else None
+        if better is not None:
+            say("found a better fit without them: starting again from there")
+            fitted, base, returns = better, base if fitted.effects else better, returns + 1
+            continue
+        accepted = best(seen, base, trials.fits, settings)
+        steps.append(Step(seen, trials, accepted))
+        if accepted is None:
+            return steps
+        keys = jax.random.fold_in(key, 1000 + len(steps))
+        steps += _revised(steps[-1], base, keys, settings, say, banned=banned)
+        reached = steps[-1].end
+        problem, fitted = reached.problem, reached.fitted
+
+
+def _looked(problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> View:
+    beside = f" beside {', '.join(fitted.effects)}" if fitted.effects else ""
+    say(f"screening {len(problem.effects)} effects{beside}")
+    return view(problem, fitted, key, settings)
+
+
+def _revised(
+    last: Step, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say, *, banned: str | None
+) -> Iterator[Step]:
+    """Every other effect once more, beside the ones chosen since: kept, or another one in its place, or none.
+
+    The first choice was made while the other effects were still in the data, and may have been made for them.
+    """
+    looked = {frozenset(last.view.fitted.effects)}
+    for i in range(_REVISIONS):
+        reached = last.end
+        chosen = reached.fitted.effects
+        left_out = next((e for e in chosen if frozenset(chosen) - {e} not in looked), None)
+        if left_out is None:
+            return
+        rest = _refitted_without(reached.problem, reached.fitted, left_out)
+        looked.add(frozenset(rest.effects))
+        seen = _looked(reached.problem, rest, jax.random.fold_in(key, i), settings, say)
+        trials = tried(seen, settings, say, {left_out: reached}, banned=banned)
+        last = Step(seen, trials, best(seen, base, trials.fits, settings))
+        yield last
+
+
+def _refitted_without(problem: Problem, fitted: fitting.Fit, name: str) -> fitting.Fit:
+    """The fit with all its effects but one."""
+    others = tuple(e for e in fitted.effects if e != name)
+    return fitting.fit(problem, at_null_except(problem, fitted, others), others, spread=fitted.spread)

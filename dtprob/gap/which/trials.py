@@ -1,0 +1,178 @@
+"""Refits with one more effect: of which candidates, and which of them is to be believed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from types import MappingProxyType
+from typing import Final
+
+import numpy as np
+from scipy.special import gammaln
+
+from dtprob.effects.effect import Effect
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.refit import polished, refit, starting_points
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.gap.view import View
+from dtprob.gap.which.scan import Found, scan
+
+type Say = Callable[[str], None]
+
+_LARGEST_FIELD: Final = 256
+"""Entries of a field per cluster up to which it is fitted entry by entry."""
+_LARGEST_TANGENTS: Final = 100_000_000
+"""Numbers that the tangents of a field may take: 0.8 GB."""
+_FIELD_SHARE: Final = 0.03
+"""Share of what was gained over the base fit that a random field has to be better by."""
+_FIELD_NATS: Final = 3.0
+"""Nats that it has to be better by in any case."""
+_SURE: Final = 3.0
+"""Nats that an effect has to bring where its score does not show it, beside those of the choice among all."""
+_LIVE: Final = 12
+"""Effects that are live at once, at most, where fewer are wanted."""
+_HOPELESS: Final = 0.05
+"""Share of the best candidate's promise below which another one is not refitted."""
+_LARGE_GAP: Final = 100.0
+"""Nats above which first-order scores may miss the effect that matters."""
+
+
+@dataclass(frozen=True)
+class Start:
+    """A fit and the problem whose coordinates it is in."""
+
+    problem: Problem
+    fitted: fitting.Fit
+
+
+@dataclass(frozen=True)
+class Trials:
+    """Refits by the name of the effect that each adds, in a problem in which all of these are live."""
+
+    problem: Problem
+    fits: Mapping[str, fitting.Fit]
+
+
+NOTHING: Final[Mapping[str, Start]] = MappingProxyType({})
+
+
+def tried(
+    seen: View,
+    settings: Settings,
+    say: Say,
+    known: Mapping[str, Start] = NOTHING,
+    *,
+    banned: str | None = None,
+) -> Trials:
+    """Refits of the most promising candidates beside the effects of a view.
+
+    Args:
+        seen: the fit, and what it calls for.
+        settings: number of refits.
+        say: receives one line for each.
+        known: candidates to refit in any case, by name, with where to start.
+        banned: a candidate that is not to be tried.
+    """
+    screening, fitted = seen.screening, seen.fitted
+    found: dict[str, Found] = {}
+    if not fitted.effects and seen.promise > _LARGE_GAP:
+        say("scanning the effects' plausible sizes")
+        found = scan(seen.problem, seen.fitted.x, screening.names)
+    scanned = np.array([found[n].gain if n in found else -np.inf for n in screening.names])
+    chosen = [n for n in _chosen(seen, scanned, settings, banned) if n not in known]
+    problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
+    start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
+    effects = {e.name: e for e in problem.effects}
+    trials = {
+        name: fitting.fit(
+            problem, problem.translate(at.fitted.x, at.problem), at.fitted.effects, spread=at.fitted.spread
+        )
+        for name, at in known.items()
+    }
+    for name in chosen:
+        say(f"refitting with {name}")
+        starts = starting_points(problem, start.x, effects[name], screening.step.get(name), settings)
+        if name in found:
+            starts.append(_scanned_start(problem, seen.problem, effects[name], found[name]))
+        trials[name] = refit(problem, start, effects[name], starts)
+    return Trials(problem, polished(problem, start, trials, settings.polished))
+
+
+def _together(problem: Problem, names: Sequence[str]) -> Problem:
+    """The problem with these effects live, and beside them some that were before: a later step may come back to them.
+
+    Each set of live effects is compiled anew, so returning to one that is live already costs nothing.
+    """
+    before = [e.name for e in problem.live if e.kind == "mean" and e.name not in names]
+    return problem.with_live([*names, *before[: max(_LIVE - len(names), 0)]])
+
+
+def credit(problem: Problem, fitted: fitting.Fit, base: fitting.Fit) -> float:
+    """Log evidence of a fit, less what its set has to be better by than a single effect.
+
+    There are more sets of several effects than single ones: sets of every size are equally likely at first, and so are
+    those of one size (Scott and Berger 2010). A random field pays besides: it can imitate nearly anything.
+
+    Args:
+        problem: whose effects were fitted.
+        fitted: the fit.
+        base: the fit of the model alone.
+    """
+    kinds = {e.name: e.kind for e in problem.effects}
+    fields = sum(kinds[name] == "variance" for name in fitted.effects)
+    gained = fitted.log_evidence - base.log_evidence
+    sets = _log_sets(len(problem.effects), len(fitted.effects)) - _log_sets(len(problem.effects), 1)
+    return fitted.log_evidence - max(sets, 0.0) - fields * max(_FIELD_NATS, _FIELD_SHARE * gained)
+
+
+def _log_sets(candidates: int, size: int) -> float:
+    """Log of the number of sets of a size."""
+    return float(gammaln(candidates + 1) - gammaln(size + 1) - gammaln(candidates - size + 1))
+
+
+def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:
+    """The refit of most credit, if the choice among all candidates has been paid for and it is no minor matter.
+
+    The family-wise level of the scores pays; where only the sites have rung the alarm the evidence has to.
+    """
+    if not trials:
+        return None
+    fitted = seen.fitted
+    chosen = max(trials, key=lambda name: credit(seen.problem, trials[name], base))
+    so_far = fitted.log_evidence - base.log_evidence
+    paid = float(seen.screening.adjusted.min(initial=1.0)) <= settings.level / 2
+    needed = max(0.0 if paid else np.log(len(seen.problem.effects)) + _SURE, settings.minor * so_far)
+    return chosen if trials[chosen].log_evidence - fitted.log_evidence > needed else None
+
+
+def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:
+    x = problem.translate(found.x, scanned)
+    x[problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)] = found.parameters
+    return x
+
+
+def _chosen(seen: View, scanned: np.ndarray, settings: Settings, banned: str | None) -> list[str]:
+    """The best candidates by score and, in equal number, by the scan."""
+    screening = seen.screening
+    able = [
+        i
+        for i, name in enumerate(screening.names)
+        if screening.absorbed_by[i] is None and name != banned and _affordable(seen.problem, name)
+    ]
+    gain = screening.log_bayes_factor
+    least = _HOPELESS * max((gain[i] for i in able), default=0.0)
+    by_score = sorted((i for i in able if gain[i] > max(least, 0.0)), key=lambda i: -gain[i])
+    by_scan = sorted((i for i in able if scanned[i] > 3.0), key=lambda i: -scanned[i])
+    half = settings.candidates // 2
+    chosen = dict.fromkeys([*by_score[:half], *by_scan[:half], *by_score[half:], *by_scan[half:]])
+    return [screening.names[i] for i in list(chosen)[: settings.candidates]]
+
+
+def _affordable(problem: Problem, name: str) -> bool:
+    """Whether a field is small enough to be fitted entry by entry."""
+    effect = next(e for e in problem.effects if e.name == name)
+    if effect.kind == "mean":
+        return True
+    size = int(np.prod(problem.field_shapes[name], dtype=int)) // problem.n_cluster
+    return size <= _LARGEST_FIELD and size * problem.rows.gather.size <= _LARGEST_TANGENTS

@@ -1,0 +1,1 @@
+"""How good diagnoses of withheld cases are: answers, truths, targets, rivals."""

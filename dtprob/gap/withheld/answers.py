@@ -1,0 +1,242 @@
+"""What was said about a withheld case, beside what is true of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Final
+
+import numpy as np
+
+from dtprob.gap.settings import Settings
+from dtprob.gap.withheld.limits import Limit, correlation_matrix, is_resolvable, limit
+from dtprob.gap.withheld.truths import PARAMETERS, SITES
+
+type Report = Mapping[str, Any]
+type Truth = Mapping[str, Any]
+
+_HAS_CAUSE: Final = ("LISTED", "LISTED_WITH_REMAINDER")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What was said about one case, beside what is true.
+
+    Attributes:
+        track: of the case; of no meaning for keys that do not name a track.
+        truth: its record in the key.
+        report: the content of its report.json, or what a rival said; None where that failed.
+        seconds: that it took, where known.
+    """
+
+    track: str
+    truth: Truth
+    report: Report | None
+    seconds: float | None
+
+    @property
+    def kind(self) -> str:
+        """Of case."""
+        return str(self.truth["kind"])
+
+    @property
+    def lambda_(self) -> float:
+        """Information that each effect carries alone; 0 where there is none."""
+        return 0.0 if self.kind == "null" else float(self.truth.get("lambda") or 0.0)
+
+    @property
+    def verdict(self) -> str:
+        """The verdict, or FAILED."""
+        return "FAILED" if self.report is None else str(self.report["verdict"])
+
+    @property
+    def effects(self) -> frozenset[str]:
+        """The true effects, by their full names."""
+        return frozenset(str(effect["name"]) for effect in self.truth["effects"])
+
+    @property
+    def first(self) -> Mapping[str, Any] | None:
+        """The most probable cause, if any is given."""
+        causes = [] if self.report is None else self.report["causes"]
+        return causes[0] if causes else None
+
+    @property
+    def named(self) -> frozenset[str]:
+        """The effects of the most probable cause."""
+        return frozenset(self.first["effects"]) if self.first else frozenset()
+
+    @property
+    def alias_class(self) -> list[frozenset[str]]:
+        """All sets of effects that the answer holds possible."""
+        return [frozenset(item) for item in self.first["alias_class"]] if self.first else []
+
+    @property
+    def is_alarm(self) -> bool:
+        """Whether a gap is claimed."""
+        return self.verdict not in {"NO_GAP", "FAILED"}
+
+    @property
+    def is_missed(self) -> bool:
+        """Whether no gap is claimed."""
+        return self.verdict == "NO_GAP"
+
+    @property
+    def is_right(self) -> bool:
+        """Whether the most probable cause is exactly the true set of effects."""
+        return self.named == self.effects
+
+    @property
+    def is_right_family(self) -> bool:
+        """Whether the families are right, whatever the instance, such as the wall or the antenna."""
+        return _families(self.named) == _families(self.effects)
+
+    @property
+    def is_in_class(self) -> bool:
+        """Whether the true set is among those that the answer holds possible."""
+        return self.is_right or self.effects in self.alias_class
+
+    @property
+    def is_listed(self) -> bool:
+        """Whether a known cause is named."""
+        return self.verdict in _HAS_CAUSE
+
+    @property
+    def is_unlisted(self) -> bool:
+        """Whether the verdict says that the cause is not among the candidates."""
+        return self.verdict == "UNLISTED"
+
+    def wrong_names(self) -> list[bool]:
+        """For each named effect whether it is none of the true ones."""
+        return [name not in self.effects for name in self.named]
+
+    def names_alias(self) -> list[bool]:
+        """Whether the effect that looks like the true one is in the class, too."""
+        alias = self.truth.get("alias")
+        return [frozenset([alias["name"]]) in self.alias_class] if alias else []
+
+    def right_site(self) -> list[bool]:
+        """Whether the first of the sites that the answer points at is one at which the true effects show."""
+        known = SITES.get(self.track, {})
+        true = {site for e in self.truth["effects"] for site in known.get(str(e.get("family")), ())}
+        if self.report is None or "where" not in self.report or not true:
+            return []
+        places = [*self.report["unlisted"]["sites"], *(s["site"] for s in self.report["where"]["sites"])]
+        return [self.is_alarm and bool(places) and places[0] in true]
+
+    def covered_size(self) -> list[bool]:
+        """Whether the 90% interval of the size holds the true one, where one right effect has a comparable size."""
+        sizes = list(self.first.get("size", {}).values()) if self.first else []
+        if not self.is_right or len(self.truth["effects"]) != 1 or not sizes:
+            return []
+        effect = self.truth["effects"][0]
+        values = PARAMETERS.get(self.track, {}).get(str(effect.get("family")))
+        if values is None:
+            return []
+        return [any(sizes[0]["low"] <= v <= sizes[0]["high"] for v in values(float(effect["size"])))]
+
+    def covered_fraction(self) -> list[bool]:
+        """Whether the 90% interval of the closed fraction holds what a right answer can expect to close.
+
+        That is 1 - d / lambda for d parameters that are known from (K - 1) / K of the data, lambda of all effects together.
+        """
+        closed = self.first.get("closed_fraction") if self.first else None
+        total = sum(float(effect.get("lambda") or 0.0) for effect in self.truth["effects"])
+        if not (self.is_right and closed and total > 0 and self.first):
+            return []
+        folds, size = Settings().folds, len(self.first.get("size", {}))
+        return [closed["low"] <= 1 - size * folds / (folds - 1) / total <= closed["high"]]
+
+    @cached_property
+    def limit(self) -> Limit | None:
+        """What the best possible diagnosis reaches; None where there is not one effect, or the report cannot tell."""
+        effects, alike = self.truth["effects"], self._alike
+        if alike is None or len(effects) != 1 or effects[0]["name"] not in alike[0]:
+            return None
+        return limit(alike[1], alike[0].index(effects[0]["name"]), float(effects[0].get("lambda") or 0.0))
+
+    @property
+    def _alike(self) -> tuple[list[str], np.ndarray] | None:
+        """The candidates of the report, and the correlations of their scores."""
+        alike = (self.report or {}).get("provenance", {}).get("alike")
+        return None if alike is None else (alike["effects"], correlation_matrix(alike["percent"]))
+
+    @property
+    def is_resolvable(self) -> bool:
+        """Whether each true effect can be told from every other candidate, as far as the report tells."""
+        alike = self._alike
+        known = [e for e in self.truth["effects"] if alike is not None and e["name"] in alike[0]]
+        return alike is not None and all(
+            is_resolvable(alike[1], alike[0].index(e["name"]), float(e.get("lambda") or 0.0)) for e in known
+        )
+
+    @property
+    def unexplained(self) -> float:
+        """Lambda that the candidates leave, lambda (1 - R^2).
+
+        They explain what the best score of a single one does, or twice the nats that the named cause gains on held-out
+        clusters, if that is more.
+        """
+        report = self.report or {}
+        best = max((float(line["z"] or 0.0) ** 2 for line in report.get("screening") or []), default=0.0)
+        gap, fit = report.get("gap", {}), report.get("fit", {})
+        known = gap.get("before") is not None and gap.get("after") is not None
+        gained = 2 * (gap["before"] - gap["after"]) * fit.get("n_observations", 0) if known else 0.0
+        return max(self.lambda_ - max(best - 1, gained, 0.0), 0.0)
+
+    def over_limit(self, of: Callable[[Limit], float]) -> list[tuple[float, float]]:
+        """Whether the right effect is first, and what the best possible diagnosis reaches."""
+        return [] if self.limit is None else [(float(self.is_right), of(self.limit))]
+
+    def screened_over_limit(self) -> list[tuple[float, float]]:
+        """Whether the right effect has the first place of the screening, and the chance of the best possible one."""
+        if self.limit is None or self.report is None or "where" not in self.report:
+            return []
+        return [(float({self.report["screening"][0]["effect"]} == self.effects), self.limit.first)]
+
+    def class_over_limit(self) -> list[tuple[float, float]]:
+        """Size of the class of a single effect, and that of the best possible one."""
+        if self.limit is None or len(self.named) != 1:
+            return []
+        return [(float(len(self.alias_class)), self.limit.class_size)]
+
+    def cell_scores(self) -> list[float]:
+        """F1 of the cells inside the reported blocks, for each axis on which the truth is local."""
+        if self.report is None or "where" not in self.report:
+            return []
+        blocks, scores = self.report["where"]["coordinates"], []
+        for axis, cells in self.truth.get("cells", {}).items():
+            said = {
+                i
+                for b in blocks
+                if axis in b["axes"]
+                for i in range(b["axes"][axis][0], b["axes"][axis][1] + 1)
+            }
+            scores.append(2 * len(said & set(cells)) / (len(said) + len(cells)))
+        return scores
+
+    def width(self) -> list[float]:
+        """Of the closed fraction's interval, where a right answer has one."""
+        closed = self.first.get("closed_fraction") if self.first else None
+        return [closed["high"] - closed["low"]] if closed and self.is_right else []
+
+    def remainder_closed(self) -> list[float]:
+        """Share that a model of the remainder closes on clusters left out; 0 where something is left and none was found."""
+        if self.report is None or "remainder" not in self.report or not self.is_unlisted:
+            return []
+        remainder = self.report["remainder"]
+        return [float(remainder["closed_fraction"]["mean"] or 0.0) if remainder else 0.0]
+
+    @staticmethod
+    def closes(share: float) -> Callable[[Answer], list[bool]]:
+        """Whether a right answer with an established gap closes a share of it."""
+
+        def test(answer: Answer) -> list[bool]:
+            closed = answer.first.get("closed_fraction") if answer.first else None
+            return [closed["mean"] >= share] if closed and answer.is_right else []
+
+        return test
+
+
+def _families(names: frozenset[str]) -> frozenset[str]:
+    return frozenset(name.split("[")[0] for name in names)

@@ -1,0 +1,168 @@
+"""How good diagnoses of withheld cases are: counts per stratum with exact binomial intervals, rivals beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Final
+
+from dtprob.errors import InputError
+from dtprob.gap.withheld.answers import Answer, Report, Truth
+from dtprob.gap.withheld.rates import quantiles, rates
+from dtprob.gap.withheld.targets import against_targets
+
+type Test = Callable[[Answer], Iterable[bool]]
+
+_LISTED_KINDS: Final = ("listed", "pair", "triple", "alias")
+_SHARED: Final = ("screening", "provenance")
+"""Parts of a report by which all methods are judged alike."""
+_EXACT: Final[Mapping[str, Test]] = {
+    "right effect first": lambda answer: [answer.is_right],
+    "right family first": lambda answer: [answer.is_right_family],
+    "truth in the class": lambda answer: [answer.is_in_class],
+    "wrong among the named": Answer.wrong_names,
+    "verdict names a cause": lambda answer: [answer.is_listed],
+    "says unlisted": lambda answer: [answer.is_unlisted],
+    "missed": lambda answer: [answer.is_missed],
+}
+_MEASURES: Final[Mapping[str, Mapping[str, Test]]] = {
+    "null": {
+        "alarm": lambda answer: [answer.is_alarm],
+        "says unlisted": lambda answer: [answer.is_unlisted],
+    },
+    "listed": {
+        **_EXACT,
+        "alias in the class": Answer.names_alias,
+        "right site first": Answer.right_site,
+        "size in its 90% interval": Answer.covered_size,
+        "closed fraction in its 90% interval": Answer.covered_fraction,
+    },
+    "unlisted": {
+        "says unlisted": lambda answer: [answer.is_unlisted],
+        "names a wrong cause": lambda answer: [answer.is_listed],
+        "missed": lambda answer: [answer.is_missed],
+        "right site first": Answer.right_site,
+    },
+}
+
+
+def score(
+    key: Mapping[str, Any],
+    reports: Mapping[str, Report | None],
+    rivals: Mapping[str, Mapping[str, Report]] = MappingProxyType({}),
+    seconds: Mapping[str, float] = MappingProxyType({}),
+) -> dict[str, Any]:
+    """Score answers against their key.
+
+    Args:
+        key: content of key.json: `cases`, each with `name`, `kind`, `lambda` and `effects`.
+        reports: content of report.json by the case's name; None where the diagnosis failed.
+        rivals: content of rivals.json by the case's name: what each rival said.
+        seconds: that the diagnosis took, by the case's name.
+
+    Returns:
+        `targets`, what is to be reached beside what was; `strata`, per kind and lambda: number of cases, verdicts, rates
+        with intervals, size of the alias class, closed fraction and width of its interval, seconds, and `rivals`, of which
+        each has the same as far as it says it; `cases`, what was said of each; `missing`, the cases without an answer.
+
+    Raises:
+        InputError: the key is none, or no case has an answer.
+    """
+    truths, track = _truths(key), str(key.get("track"))
+    answers = {
+        name: Answer(track, truth, reports[name], seconds.get(name))
+        for name, truth in truths.items()
+        if name in reports
+    }
+    if not answers:
+        raise InputError(
+            "answers", "a report for cases of this key", "none", "Give the folder of the answers"
+        )
+    strata = {(a.kind, a.lambda_): [n for n in answers if _same(answers[n], a)] for a in answers.values()}
+    theirs = _rival_answers(answers, rivals)
+    return {
+        "format": "dtprob.score",
+        "version": 2,
+        "targets": against_targets(
+            list(answers.values()), {rival: list(said.values()) for rival, said in theirs.items()}
+        ),
+        "strata": [
+            {
+                "kind": kind,
+                "lambda": size,
+                **_judged([answers[name] for name in names]),
+                "rivals": {
+                    rival: _judged([said[name] for name in names if name in said])
+                    for rival, said in theirs.items()
+                    if any(name in said for name in names)
+                },
+            }
+            for (kind, size), names in sorted(strata.items())
+        ],
+        "cases": [_line(name, answer) for name, answer in answers.items()],
+        "missing": [name for name in truths if name not in reports],
+    }
+
+
+def _truths(key: Mapping[str, Any]) -> dict[str, Truth]:
+    try:
+        truths = {str(case["name"]): case for case in key["cases"]}
+        for truth in truths.values():
+            _ = truth["kind"], [effect["name"] for effect in truth["effects"]]
+    except (KeyError, TypeError) as error:
+        expected = "`cases`, each with name, kind, lambda and effects"
+        raise InputError("key", expected, f"none of {error}", "Give the key.json of these cases") from error
+    return truths
+
+
+def _same(one: Answer, other: Answer) -> bool:
+    return (one.kind, one.lambda_) == (other.kind, other.lambda_)
+
+
+def _rival_answers(
+    answers: Mapping[str, Answer], rivals: Mapping[str, Mapping[str, Report]]
+) -> dict[str, dict[str, Answer]]:
+    """The answers of each rival by the case's name."""
+    found: dict[str, dict[str, Answer]] = {}
+    for name, said in rivals.items():
+        for rival, report in said.items():
+            own = answers[name]
+            seen = {part: own.report[part] for part in _SHARED if own.report and part in own.report}
+            seconds = report.get("seconds")
+            found.setdefault(rival, {})[name] = Answer(own.track, own.truth, {**seen, **report}, seconds)
+    return found
+
+
+def _judged(answers: Sequence[Answer]) -> dict[str, Any]:
+    """One method's row of one stratum."""
+    group = "listed" if answers[0].kind in _LISTED_KINDS else answers[0].kind
+    verdicts = sorted({answer.verdict for answer in answers})
+    result: dict[str, Any] = {
+        "cases": len(answers),
+        "verdicts": {verdict: sum(a.verdict == verdict for a in answers) for verdict in verdicts},
+        "rates": rates(_MEASURES.get(group, _MEASURES["null"]), answers),
+        "seconds": quantiles([a.seconds for a in answers if a.seconds is not None]),
+    }
+    if group == "listed":
+        right = [a.first["closed_fraction"] for a in answers if a.is_right and a.first]
+        closed = [fraction for fraction in right if fraction]
+        result["closed_fraction"] = quantiles([fraction["mean"] for fraction in closed])
+        result["closed_fraction_width"] = quantiles([f["high"] - f["low"] for f in closed])
+        result["class_size"] = quantiles([len(a.alias_class) for a in answers if a.first])
+    return result
+
+
+def _line(name: str, answer: Answer) -> dict[str, Any]:
+    return {
+        "name": name,
+        "kind": answer.kind,
+        "lambda": answer.truth.get("lambda"),
+        "true": sorted(answer.effects),
+        "verdict": answer.verdict,
+        "named": sorted(answer.named),
+        "probability": answer.first["probability"] if answer.first else None,
+        "right": answer.is_right if answer.kind in _LISTED_KINDS else None,
+        "best_possible": answer.limit.named if answer.limit else None,
+        "unexplained": answer.unexplained if answer.kind == "unlisted" else None,
+        "seconds": answer.seconds,
+    }

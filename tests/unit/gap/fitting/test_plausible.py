@@ -1,0 +1,96 @@
+"""Evidence with the scale of the prior mixed, against quadrature."""
+
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from scipy import integrate, stats
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.fitting.plausible import SCALES, log_bayes_factor, mixing_gain, nulls, scales, sides
+
+
+def quadrature(information, score, scale, low=-np.inf):
+    """Evidence of a normal likelihood with a prior of mixed scale, over that of the null."""
+
+    def integrand(size, width):
+        prior = stats.norm(0, width).pdf(size) * (2 if low == 0 else 1)
+        return np.exp(score * size - 0.5 * information * size**2) * prior
+
+    def one(width):
+        reach = 12 * width
+        points = [score / information] if -reach < score / information < reach else None
+        return integrate.quad(integrand, max(low, -reach), reach, args=(width,), points=points, limit=400)[0]
+
+    return np.log(np.mean([one(s * scale) for s in SCALES]))
+
+
+@pytest.mark.parametrize("score", [0.0, 3.0, -12.0])
+@pytest.mark.parametrize("one_sided", [False, True])
+def test_one_parameter(score, one_sided):
+    found = log_bayes_factor(np.array([[9.0]]), np.array([score]), np.array([2.0]), one_sided=one_sided)
+    expected = quadrature(9.0, score, 2.0, 0.0 if one_sided else -np.inf)
+    assert found == pytest.approx(expected, abs=1e-6)
+
+
+def test_several_parameters_that_share_a_scale():
+    rng = np.random.default_rng(0)
+    root = rng.normal(size=(3, 3))
+    information, score, scale = root @ root.T * 20, rng.normal(size=3) * 5, np.array([0.1, 1.0, 3.0])
+    covariance = [np.diag(s**2 * scale**2) for s in SCALES]
+    # The score's density is N(0, J + J T J) with the effect and N(0, J) without it.
+    without = stats.multivariate_normal(np.zeros(3), information).logpdf(score)
+    ratio = [
+        stats.multivariate_normal(np.zeros(3), information + information @ t @ information).logpdf(score)
+        - without
+        for t in covariance
+    ]
+    assert log_bayes_factor(information, score, scale) == pytest.approx(
+        np.log(np.mean(np.exp(ratio))), abs=1e-8
+    )
+
+
+@pytest.mark.parametrize("one_sided", [False, True])
+def test_the_gain_over_the_largest_scale(one_sided):
+    information, score, scale = np.array([[50.0]]), np.array([9.0]), np.array([0.7])
+    precision = information + np.diag(scale**-2.0)
+    mode = np.linalg.solve(precision, score)
+    found = mixing_gain(np.linalg.inv(precision), mode, scale, one_sided=one_sided)
+    mixed = log_bayes_factor(information, score, scale, one_sided=one_sided)
+    widest = 0.5 * (score @ mode - np.log(1 + information[0, 0] * scale[0] ** 2))
+    if one_sided:
+        widest += np.log(2) + stats.norm.logcdf(score[0] / np.sqrt(precision[0, 0]))
+    assert found == pytest.approx(mixed - widest, abs=1e-9)
+
+
+def test_the_unit_of_a_parameter_does_not_matter():
+    """Far from both ends of its range an effect costs the same whatever its largest plausible size."""
+    costs = [log_bayes_factor(np.array([[1e4]]), np.array([1e3]), np.array([s])) for s in (1.0, 3.0, 10.0)]
+    assert np.ptp(costs) < 0.1
+
+
+def test_flat_sizes_of_an_effect():
+    effect = Effect(
+        "both",
+        {"mean": lambda v, p, c: v},
+        (
+            Parameter("loss", dist.HalfNormal(0.3), null=0.0),
+            Parameter("shift", dist.Normal(0.0, 2.0).expand([2]).to_event(1)),
+        ),
+    )
+    np.testing.assert_allclose(scales(effect), [0.3, 2.0, 2.0])
+    np.testing.assert_allclose(nulls(effect), 0.0)
+    np.testing.assert_array_equal(sides(effect), [True, False, False])
+
+
+def test_the_prior_of_a_place_is_not_mixed():
+    """Where sizes and places say nothing of one another, what is gained is what the sizes alone gain."""
+    scale, estimate = np.array([2.0, 0.3, 0.05]), np.array([0.02, 0.1, -0.04])
+    covariance = np.diag(np.array([0.01, 0.05, 0.03]) ** 2)
+    places = np.array([False, False, True])
+    both = mixing_gain(covariance, estimate, scale, places=places)
+    sizes = mixing_gain(covariance[:2, :2], estimate[:2], scale[:2])
+    np.testing.assert_allclose(both, sizes, rtol=1e-10)
+    assert mixing_gain(covariance, estimate, scale) != pytest.approx(both, abs=0.1)
+    np.testing.assert_allclose(
+        mixing_gain(covariance, estimate, scale, places=~np.zeros(3, bool)), 0.0, atol=1e-10
+    )

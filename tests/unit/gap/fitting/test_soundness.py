@@ -1,0 +1,137 @@
+"""What is wrong with a base model, its data or its effects is said in one line, before any cause is named."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.cli import main
+from dtprob.effects import Effect, Parameter
+from dtprob.errors import InputError
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.soundness import UNSEEN, idle, notes
+from dtprob.gap.model.problem import Problem
+from dtprob.inference import Laplace
+from tests.unit.gap.examples import bend, draw, inputs, line
+from tests.unit.test_cli import CASE, EFFECTS, MODEL
+
+
+def observed(mean, y, x):
+    with numpyro.plate("link", x.shape[0], dim=-2), numpyro.plate("sample", x.shape[1], dim=-1):
+        mean = numpyro.deterministic("mean", mean)
+        numpyro.sample("y", dist.Normal(mean, 0.5), obs=y)
+
+
+def harmonics(x, y=None):
+    """Eight parameters."""
+    size = numpyro.sample("size", dist.Normal(0.0, 3.0).expand([8]).to_event(1))
+    observed(jnp.tensordot(size, jnp.cos(jnp.arange(8)[:, None, None] * x), 1), y, x)
+
+
+def twice(x, y=None):
+    """Two levels of which the data see the sum, and a parameter that they do not see."""
+    levels = [numpyro.sample(name, dist.Normal(0.0, 1e4)) for name in ("floor", "ceiling")]
+    numpyro.sample("unseen", dist.Normal(0.0, 1.0))
+    slope = numpyro.sample("slope", dist.Normal(0.0, 3.0))
+    observed(sum(levels) + slope * x, y, x)
+
+
+def undefined(x, y=None):
+    """The logarithm of what is negative."""
+    observed(jnp.log(-1 - numpyro.sample("a", dist.Normal(0.0, 1.0)) ** 2) * x, y, x)
+
+
+def sometimes(x, y=None):
+    """Defined for half of the prior."""
+    observed(jnp.log(numpyro.sample("a", dist.Normal(0.2, 1.0))) * x, y, x)
+
+
+def improper(x, y=None):
+    """A prior that cannot be drawn from."""
+    observed(numpyro.sample("a", dist.ImproperUniform(dist.constraints.real, (), ())) + x, y, x)
+
+
+def noted(model, data, effects=()):
+    problem = Problem(model, data, effects or [bend()])
+    return notes(problem, fit_base(problem, jax.random.key(0), starts=1, polished=0))
+
+
+def test_a_sound_fit_is_not_noted():
+    assert noted(line, draw("line")) == ()
+
+
+def test_fewer_clusters_than_parameters():
+    x = inputs(n_link=4)
+    data = {"x": jnp.asarray(x), "y": jnp.asarray(np.cos(x))}
+    assert any(n.startswith("4 clusters for 8 fitted parameters") for n in noted(harmonics, data))
+
+
+def test_absorbed_parameters_are_named():
+    found = noted(twice, draw("line"))
+    assert "the data tell nothing about unseen" in found
+    assert any("only a combination of floor, ceiling;" in note for note in found)
+    assert not any("slope" in note for note in found)
+
+
+def test_no_fit_at_all():
+    data = draw("line")
+    found = noted(line, {**data, "y": 1e9 * data["y"]})
+    assert any("does not fit at all" in note and "leaves of y" in note for note in found)
+
+
+def test_some_starts_may_lead_nowhere():
+    data = draw("line")
+    problem = Problem(sometimes, data, [bend()])
+    found = fit_base(problem, jax.random.key(0), polished=0)
+    assert np.isfinite(found.log_posterior)
+
+
+@pytest.mark.parametrize(
+    ("model", "spoilt", "text"),
+    [
+        (undefined, False, r"base model undefined, site mean: expected finite .* 96 of 96"),
+        (line, True, r"data y: expected finite values, got 1 of 96 that are not, the first at \[0, 3\]"),
+        (improper, False, "model improper: expected distributions that can be drawn from"),
+    ],
+)
+def test_what_breaks_is_named_before_effects_are_tried(model, spoilt, text):
+    data = draw("line")
+    if spoilt:
+        data = {**data, "y": data["y"].at[0, 3].set(jnp.nan)}
+    with pytest.raises(InputError, match=text):
+        diagnose(model, data, [bend()], key=jax.random.key(0), engine=Laplace())
+
+
+def test_effects_that_do_nothing_are_named():
+    with pytest.raises(InputError, match="a site to rewrite"):
+        Effect("none", {}, (Parameter("c", dist.Normal(0.0, 1.0)),))
+    assert idle([UNSEEN, UNSEEN]) == ["nothing observed depends on any of the effects"]
+    assert idle([UNSEEN, None]) == idle(["slope"]) == idle([]) == []
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "text"),
+    [
+        ('{"mean":', '{"men":', "effect bias: expected sites among slope, mean, y, got men."),
+        ("slope * x", "jnp.log(-1 - slope**2) * x", "base model line, site mean: expected finite values"),
+        (
+            "dist.Normal(0.0, 10.0))",
+            "dist.ImproperUniform(dist.constraints.real, (), ()))",
+            "model line: expected distributions that can be drawn from",
+        ),
+    ],
+)
+def test_a_case_says_so_in_one_line(old, new, text, tmp_path, capsys):
+    assert old in MODEL + EFFECTS
+    rows = np.column_stack([inputs().reshape(-1), draw("line")["y"].reshape(-1)])
+    np.savetxt(tmp_path / "line.csv", rows, delimiter=",", header="x,y", comments="")
+    (tmp_path / "line_model.py").write_text(MODEL.replace(old, new))
+    (tmp_path / "line_effects.py").write_text(EFFECTS.replace(old, new))
+    (tmp_path / "case.toml").write_text(CASE)
+    assert main(["diagnose", str(tmp_path / "case.toml"), "--out", str(tmp_path / "out")]) == 2
+    lines = [row for row in capsys.readouterr().err.splitlines() if "expected" in row]
+    assert len(lines) == 1
+    assert text in lines[0]

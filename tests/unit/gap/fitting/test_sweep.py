@@ -1,0 +1,109 @@
+"""Clusters' own coordinates that only an angle and another one together free from a wrong optimum."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects import Effect, Parameter
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.refit import starting_points
+from dtprob.gap.fitting.sweep import swept, turned
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.models.complex_normal import ComplexNormal
+from dtprob.models.declaration import model
+
+FREQUENCY = np.linspace(8.0, 14.0, 12)
+LATE = np.array([-1.6, -0.7, 0.0, 0.9, 1.7])
+PHASE = np.array([0.3, -2.0, 1.0, 2.9, -0.6])
+NOISE = 0.1
+BEND = Effect(
+    "bend", {"level": lambda value, p, _: value + p["by"]}, (Parameter("by", dist.Normal(0.0, 1.0)),)
+)
+LATER = Effect(
+    "later",
+    {"wave": lambda value, p, _: value * jnp.exp(-1j * p["by"] * FREQUENCY)},
+    (Parameter("by", dist.Normal(0.0, 0.5)),),
+)
+
+
+@model(cluster="link", axes={"level": (), "wave": ("link", "tone")})
+def delayed(links, y=None):
+    """Tones far from zero frequency: a delay that is off turns their phase by whole circles."""
+    level = numpyro.deterministic("level", numpyro.sample("scale", dist.Normal(1.0, 0.1)))
+    with numpyro.plate("link", links, dim=-2):
+        phase = numpyro.sample("phase", dist.VonMises(0.0, 1e-9))
+        late = numpyro.sample("late", dist.Normal(0.0, 1.0))
+        wave = numpyro.deterministic("wave", level * jnp.exp(1j * (phase - late * FREQUENCY)))
+        with numpyro.plate("tone", len(FREQUENCY), dim=-1):
+            numpyro.sample("y", ComplexNormal(wave, NOISE**2), obs=y)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    noise = jax.random.normal(jax.random.key(0), (2, len(LATE), len(FREQUENCY))) * NOISE / np.sqrt(2)
+    wave = np.exp(1j * (PHASE[:, None] - LATE[:, None] * FREQUENCY))
+    return Problem(
+        delayed, {"links": len(LATE), "y": jnp.asarray(wave + noise[0] + 1j * noise[1])}, [BEND, LATER]
+    )
+
+
+def places(problem, x):
+    return x[problem.layout["late"].index[:, 0]]
+
+
+def test_usual_places_are_those_of_the_prior(problem):
+    centre, scale = problem.usual["late"]
+    assert np.isclose(centre, 0.0, atol=0.1)
+    assert np.isclose(scale, 1.0, atol=0.15)
+
+
+def test_every_link_is_freed_from_its_wrong_basin(problem):
+    start = problem.start({"scale": 1.0, "phase": np.zeros((5, 1)), "late": np.zeros((5, 1))})
+    stuck = fitting.fit(problem, turned(problem, start, problem.compiled.by_cluster))
+    assert np.abs(places(problem, stuck.x) - LATE).max() > 0.3
+    free = fitting.settled(problem, stuck)
+    np.testing.assert_allclose(places(problem, free.x), LATE, atol=0.06)
+    assert free.log_posterior > stuck.log_posterior + 100
+    assert fitting.settled(problem, free) is free
+    based = fit_base(problem, jax.random.key(1), polished=0)
+    np.testing.assert_allclose(places(problem, based.x), LATE, atol=0.06)
+
+
+def test_a_link_that_was_left_out_is_judged_at_its_best(problem):
+    free = fit_base(problem, jax.random.key(1), polished=0)
+    moved = free.x.copy()
+    moved[problem.layout["late"].index[0]] += 1.9
+    away = fitting.marginal(problem, fitting.Fit(moved, *list(vars(free).values())[1:]))
+    np.testing.assert_allclose(away, fitting.marginal(problem, free), atol=1e-2)
+
+
+def test_a_sweep_keeps_what_is_best_and_what_is_shared(problem):
+    free = fit_base(problem, jax.random.key(1), polished=0)
+    found = swept(problem, free.x, problem.compiled.by_cluster)
+    assert np.all(problem.compiled.by_cluster(found) >= problem.compiled.by_cluster(free.x))
+    shared = problem.layout["scale"].index[0]
+    np.testing.assert_array_equal(found[shared], free.x[shared])
+    nowhere = swept(problem, free.x, lambda x: np.full(len(LATE), np.nan))
+    np.testing.assert_array_equal(nowhere, free.x)
+
+
+def test_large_sizes_are_tried_with_the_links_found_anew(problem):
+    free = fit_base(problem, jax.random.key(1), polished=0)
+    wider = problem.with_live(["later"])
+    x, index = wider.translate(free.x, problem), wider.layout["later.by"].index[0]
+    starts = starting_points(wider, x, LATER, None, Settings(starts=2))
+    large = [
+        start
+        for start in starts
+        if np.abs(start[index]).item() >= 0.35 and np.any(places(wider, start) != places(wider, x))
+    ]
+    assert len(large) == 2
+    for start in large:
+        held = x.copy()
+        held[index] = start[index]
+        assert wider.compiled.by_cluster(start).sum() > wider.compiled.by_cluster(held).sum() + 100

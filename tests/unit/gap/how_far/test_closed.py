@@ -1,0 +1,136 @@
+"""Held-out losses and the closed fraction, against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from scipy import stats
+
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.how_far import closed
+from dtprob.gap.how_far.closed import Floor, HeldOut
+from dtprob.gap.model.problem import Problem
+from tests.unit.gap.examples import SIGMA, bend, draw, line
+
+
+def held(log_likelihood):
+    zero = np.zeros(len(log_likelihood))
+    return HeldOut(np.asarray(log_likelihood, float), zero, zero, {})
+
+
+@pytest.mark.parametrize(("n", "parts"), [(12, 4), (13, 4), (4, 8), (5, 1)])
+def test_folds_are_balanced(n, parts):
+    found = closed.folds(n, parts)
+    counts = np.bincount(found)
+    assert found.shape == (n,)
+    assert len(counts) == max(2, min(parts, n))
+    assert counts.max() - counts.min() <= 1
+
+
+def test_cross_fit_judges_each_cluster_by_the_others():
+    data = draw("line")
+    problem = Problem(line, data, [bend()])
+    x, y = np.asarray(data["x"]), np.asarray(data["y"])
+    assignment = closed.folds(12, 3)
+    found = closed.cross_fit(problem, fitting.fit(problem, np.zeros(2)), assignment)
+    for fold in range(3):
+        out = assignment == fold
+        a = np.stack([np.ones(x[~out].size), x[~out].ravel()], axis=1)
+        precision = a.T @ a / SIGMA**2 + np.diag([2.0**-2, 3.0**-2])
+        mean = np.linalg.solve(precision, a.T @ y[~out].ravel() / SIGMA**2)
+        residual = y[out] - mean[0] - mean[1] * x[out]
+        # The fit stops where another step would gain a thousandth of a nat.
+        expected = stats.norm(0, SIGMA).logpdf(residual).sum(1)
+        np.testing.assert_allclose(found.log_likelihood[out], expected, atol=0.05)
+        np.testing.assert_allclose(found.error[out], (residual**2).sum(1), atol=0.05)
+    np.testing.assert_allclose(
+        closed.error_db(problem, found), 10 * np.log10(found.error.sum() / (y**2).sum()), rtol=1e-9
+    )
+
+
+def test_fraction_of_a_known_gap():
+    rng = np.random.default_rng(0)
+    gain = 10 + rng.normal(size=400)
+    before, after = held(np.zeros(400)), held(gain)
+    total = gain.sum()
+    exact = closed.closed_fraction(before, after, Floor(total, total), jax.random.key(0))
+    assert exact is not None
+    assert exact.mean == pytest.approx(1.0)
+    half = closed.closed_fraction(before, after, Floor(2 * total, 2 * total), jax.random.key(0))
+    assert half is not None
+    assert half.mean == pytest.approx(0.5, abs=0.01)
+    wide = closed.closed_fraction(before, after, Floor(total, 2 * total), jax.random.key(0))
+    assert wide is not None
+    assert wide.low == pytest.approx(1 / 1.95, abs=0.01)
+    assert wide.high == pytest.approx(1 / 1.05, abs=0.015)
+
+
+def test_no_fraction_of_a_gap_that_is_not_established():
+    rng = np.random.default_rng(1)
+    noise = rng.normal(size=40)
+    noise -= noise.mean()
+    assert (
+        closed.closed_fraction(held(np.zeros(40)), held(noise + 0.01), Floor(1.0, 2.0), jax.random.key(0))
+        is None
+    )
+    assert (
+        closed.closed_fraction(held(np.zeros(40)), held(-np.ones(40)), Floor(1.0, 2.0), jax.random.key(0))
+        is None
+    )
+
+
+def test_interval_covers_the_share_in_the_population():
+    """Gains per cluster N(1, 1), a remainder of 1 per cluster: the share is 1/2."""
+    n, trials, hits = 60, 200, 0
+    for i in range(trials):
+        gain = 1 + np.random.default_rng(i).normal(size=n)
+        rest = gain.sum() + n
+        found = closed.closed_fraction(
+            held(np.zeros(n)), held(gain), Floor(rest, rest), jax.random.key(i), draws=400
+        )
+        hits += found is not None and found.low <= 0.5 <= found.high
+    assert stats.binom.ppf(1e-3, trials, 0.86) <= hits <= stats.binom.ppf(0.999, trials, 0.94)
+
+
+@pytest.mark.parametrize("size", [1, 3])
+def test_interval_covers_what_estimation_costs(size):
+    """Clusters N(m, 1) of `size` entries, m known to be 0 and in truth 1: what the fit of m does to clusters never seen."""
+    n, parts, trials, hits = 200, 4, 200, 0
+    cost = 0.5 * size * parts / (parts - 1)
+    for i in range(trials):
+        rng = np.random.default_rng(i)
+        y, error = 1 + rng.normal(size=(n, size)), rng.normal(size=size) * np.sqrt(2 * cost / size / n)
+        gain = 0.5 * (y**2 - (y - 1 - error) ** 2).sum(1)
+        reached = float(gain.sum())
+        found = closed.closed_fraction(
+            held(np.zeros(n)), held(gain), Floor(reached, reached, size, cost), jax.random.key(i), draws=400
+        )
+        assert found is not None
+        expected = n * size / 2 - n * (error**2).sum() / 2
+        hits += found.low <= expected / (n * size / 2) <= found.high
+    assert stats.binom.ppf(1e-3, trials, 0.86) <= hits <= stats.binom.ppf(0.999, trials, 0.94)
+
+
+def levels(device, y=None):
+    """A level of its own for each row; `device` only names them."""
+    del device
+    with numpyro.plate("row", 6, dim=-2):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("sample", 5, dim=-1):
+            mean = numpyro.deterministic("mean", level + jnp.zeros((6, 5)))
+            numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+@pytest.mark.parametrize("order", [np.arange(6), np.array([3, 0, 5, 1, 4, 2])])
+def test_local_coordinates_follow_the_names_of_clusters(order):
+    y = np.arange(6.0)[:, None] + SIGMA * np.random.default_rng(0).normal(size=(6, 5))
+    problem = Problem(levels, {"device": order, "y": jnp.asarray(y)}, [], "device")
+    fitted = fitting.fit(problem, problem.null(), tolerance=1e-9)
+    expected = y.sum(1) / SIGMA**2 / (5 / SIGMA**2 + 1)
+    found = problem.compiled.sites(fitted.x)["level"][:, 0]
+    np.testing.assert_allclose(found, expected, rtol=1e-5)
+    covariance = SIGMA**2 * np.eye(5) + 1.0
+    marginal = [stats.multivariate_normal(np.zeros(5), covariance).logpdf(row) for row in y]
+    np.testing.assert_allclose(fitting.marginal(problem, fitted), marginal, rtol=1e-5)

@@ -1,0 +1,118 @@
+"""Where rows and coordinates lie: clusters of unequal size, padding, columns as clusters, local blocks."""
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from dtprob.errors import InputError
+from dtprob.gap.model.layout import make_layout
+from dtprob.gap.model.rows import make_rows
+from dtprob.models.declaration import declare
+
+
+def grid_model(y=None, count=None):
+    with numpyro.plate("link", 3, dim=-2):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("sample", 4, dim=-1):
+            numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+        numpyro.sample("count", dist.Poisson(jnp.ones((3, 1))), obs=count)
+
+
+def flat_model(y=None, device=None):
+    with numpyro.plate("row", 7):
+        numpyro.sample("y", dist.Normal(0.0, 1.0), obs=y)
+
+
+GRID = {"y": np.zeros((3, 4)), "count": np.ones((3, 1), int)}
+SHAPES = {"y": (2, 3, 4), "count": (1, 3, 1)}
+
+
+def test_rows_of_all_sites_gather_by_cluster():
+    rows = make_rows(declare(grid_model, GRID), SHAPES, {"y": 1, "count": 1}, GRID, None)
+    values = {"y": jnp.arange(24.0).reshape(2, 3, 4), "count": 100.0 + jnp.arange(3.0).reshape(1, 3, 1)}
+    stacked = np.asarray(rows.stack(values))
+    assert rows.cluster_name == "link"
+    assert rows.n_cluster == 3
+    for link in range(3):
+        own = np.concatenate([np.asarray(values["y"])[:, link].ravel(), [100.0 + link]])
+        assert sorted(stacked[link]) == sorted(own)
+
+
+def test_coordinates_name_each_row():
+    rows = make_rows(declare(grid_model, GRID), SHAPES, {"y": 1, "count": 1}, GRID, None)
+    y, n = np.indices((2, 3, 4)), 24
+    np.testing.assert_array_equal(rows.coordinates["link"][:n], y[1].ravel())
+    np.testing.assert_array_equal(rows.coordinates["sample"][:n], y[2].ravel())
+    np.testing.assert_array_equal(rows.coordinates["link"][n:], [0, 1, 2])
+    np.testing.assert_array_equal(rows.located[:n], (y[0] == 0).ravel())
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.integers(-3, 3), min_size=7, max_size=7))
+@example([2, 0, 3, -1, 1, -3, -2])
+def test_a_column_makes_ragged_clusters(labels):
+    data = {"y": np.zeros(7), "device": np.array(labels)}
+    rows = make_rows(declare(flat_model, data), {"y": (2, 7)}, {"y": 1}, data, "device")
+    value = jnp.arange(1.0, 15.0).reshape(2, 7)
+    stacked = np.asarray(rows.stack({"y": value}))
+    names = labels if len(set(labels)) == len(labels) else np.unique(labels)
+    assert rows.n_cluster == len(names)
+    for c, name in enumerate(names):
+        own = np.asarray(value)[:, np.array(labels) == name].ravel()
+        assert sorted(stacked[c][stacked[c] > 0]) == sorted(own)
+    assert stacked.sum() == value.sum()  # every row once, padding is zero
+    padded = rows.by_cluster(rows.located) < 0
+    assert np.all(stacked[padded] == 0)
+
+
+def test_text_may_name_clusters():
+    data = {"y": np.zeros(7), "device": np.array(list("bbacaab"))}
+    rows = make_rows(declare(flat_model, {"y": np.zeros(7)}), {"y": (1, 7)}, {"y": 1}, data, "device")
+    np.testing.assert_array_equal(rows.ids, [1, 1, 0, 2, 0, 0, 1])
+
+
+def test_an_unknown_cluster_axis_is_refused():
+    with pytest.raises(InputError, match="cluster"):
+        make_rows(declare(grid_model, GRID, cluster="room"), SHAPES, {"y": 1, "count": 1}, GRID, None)
+
+
+def test_local_blocks_have_one_row_per_cluster():
+    layout = make_layout(
+        [
+            ("scale", None, (), ()),
+            ("level", None, (3, 2), ("link", "tap")),
+            ("turn", None, (2, 3), ("tap", "link")),
+            ("bias", "offset", (2,), ("tap",)),
+        ],
+        "link",
+        3,
+    )
+    assert layout.dimension == 15
+    assert [b.local for b in layout.blocks] == [False, True, True, False]
+    np.testing.assert_array_equal(layout["level"].index, [[1, 2], [3, 4], [5, 6]])
+    np.testing.assert_array_equal(layout["turn"].index, [[7, 10], [8, 11], [9, 12]])
+    np.testing.assert_array_equal(layout["bias"].index, [[13, 14]])
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.lists(st.lists(st.integers(1, 3), max_size=3), min_size=1, max_size=4))
+def test_parts_come_back_as_they_were_put(shapes):
+    entries = [(f"s{i}", None, tuple(s), tuple(f"a{j}" for j in range(len(s)))) for i, s in enumerate(shapes)]
+    layout, x = make_layout(entries, None, 1), np.zeros(sum(int(np.prod(s)) for s in shapes))
+    values = {e[0]: np.random.default_rng(i).normal(size=e[2]) for i, e in enumerate(entries)}
+    for name, value in values.items():
+        layout.put(x, name, value)
+    for name, value in values.items():
+        np.testing.assert_array_equal(layout.part(x, name), value)
+
+
+def test_shared_blocks_move_between_layouts():
+    old = make_layout([("a", None, (2,), ()), ("b", None, (3,), ("link",))], "link", 3)
+    new = make_layout([("b", None, (3,), ("link",)), ("new", "e", (), ()), ("a", None, (2,), ())], "link", 3)
+    x = np.full(6, -1.0)
+    new.copy_into(x, old, np.arange(5.0))
+    np.testing.assert_array_equal(x, [2, 3, 4, -1, 0, 1])

@@ -1,0 +1,140 @@
+"""Designs as data of a model: predictions of rival fits in closed form, and a rival split after a diagnosis."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.errors import InputError
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.next_measurement.design import rank
+from dtprob.gap.next_measurement.design_data import designs_of
+from dtprob.gap.settings import Settings
+from dtprob.inference import Laplace
+
+SIGMA = 0.3
+FAST = Settings(replicates=100, site_replicates=39, candidates=2, polished=1)
+
+
+def line(x, y=None):
+    """A line with known noise."""
+    level = numpyro.sample("a", dist.Normal(0.0, 2.0))
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("row", len(x)):
+        mean = numpyro.deterministic("mean", level + slope * x)
+        numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+def bend(power):
+    """A term |x|^power."""
+    return Effect(
+        f"bend_{power}",
+        {"mean": lambda v, p, c: v + p["c"] * jnp.abs(c["x"]) ** power},
+        (Parameter("c", dist.Normal(0.0, 2.0)),),
+        requires=("x",),
+    )
+
+
+EFFECTS = (bend(2), bend(3))
+
+
+def data(x, truth, seed):
+    noise = np.random.default_rng(seed).standard_normal(len(x))
+    return {"x": jnp.asarray(x), "y": jnp.asarray(0.5 + x + 1.5 * np.abs(x) ** truth + SIGMA * noise)}
+
+
+def test_predictions_are_those_of_a_linear_model():
+    x, new = np.linspace(1, 2, 24), np.array([-3.0, 0.0, 3.0])
+    plain = Problem(line, data(x, 2, 0), EFFECTS)
+    problem = plain.with_live([effect.name for effect in EFFECTS])
+    fits = [fitting.fit(problem, problem.null(), [effect.name]) for effect in EFFECTS]
+    there = Problem(line, data(new, 2, 1), EFFECTS).with_live([effect.name for effect in EFFECTS])
+    designs = designs_of(there, problem, fits, "new")
+    assert [design.where for design in designs] == [{"design": "new", "row": k} for k in range(3)]
+    for row, at in enumerate(new):
+        means = []
+        for rival, fitted in enumerate(fits):
+            power = 2 + rival
+            matrix = np.column_stack([np.ones_like(x), x, np.abs(x) ** power]) / SIGMA
+            precision = matrix.T @ matrix + np.diag([1 / 4, 1 / 9, 1 / 4])
+            np.testing.assert_allclose(fitted.covariance, np.linalg.inv(precision), rtol=1e-4)
+            coefficients = np.linalg.solve(precision, matrix.T @ np.asarray(problem.data["y"]) / SIGMA)
+            terms = np.array([1.0, at, np.abs(at) ** power])
+            means.append(terms @ coefficients / SIGMA)
+            found = designs[row].predictions[rival]
+            np.testing.assert_allclose(found.tangents[0], terms / SIGMA, rtol=1e-6, atol=1e-9)
+            np.testing.assert_allclose(found.tangents[1], 0.0, atol=1e-9)
+        first, second = designs[row].predictions
+        assert second.mean[0] - first.mean[0] == pytest.approx(means[1] - means[0], rel=1e-3)
+    assert rank(designs)[0].where["row"] in {0, 2}
+
+
+def hierarchy(x, y=None):
+    """A line on links whose levels are their own."""
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("link", x.shape[0], dim=-2):
+        level = numpyro.sample("a", dist.Normal(0.0, 1.0))
+        with numpyro.plate("sample", x.shape[1], dim=-1):
+            mean = numpyro.deterministic("mean", level + slope * x)
+            numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+def test_a_new_links_own_level_is_known_by_its_prior_only():
+    x = np.random.default_rng(0).normal(size=(8, 6))
+    rng = np.random.default_rng(1)
+    y = rng.normal(size=(8, 1)) + x + 0.5 * np.abs(x) ** 2 + SIGMA * rng.normal(size=x.shape)
+    problem = Problem(hierarchy, {"x": jnp.asarray(x), "y": jnp.asarray(y)}, EFFECTS).with_live(
+        [effect.name for effect in EFFECTS]
+    )
+    fits = [fitting.fit(problem, problem.null(), [effect.name]) for effect in EFFECTS]
+    first, second = designs_of(problem, problem, fits, "again")[2].predictions
+    law = np.eye(6) + np.ones((6, 6)) / SIGMA**2
+    located = first.tangents[np.abs(first.tangents[:, 0]) > 1e-9][:, 0]
+    expected = x[2] / SIGMA
+    assert located @ located == pytest.approx(expected @ np.linalg.solve(law, expected), rel=1e-6)
+    assert first.mean == pytest.approx(np.zeros(len(first.mean)))
+    assert np.abs(second.mean).max() > 0
+
+
+def test_a_diagnosis_recommends_what_splits_its_class():
+    x = np.linspace(0.3, 2.0, 40)
+    wide = np.linspace(-3, 3, 7)
+    options = {"key": jax.random.key(0), "engine": Laplace(draws=100), "settings": FAST}
+    before = data(x, 2, 0)
+    found = diagnose(line, before, EFFECTS, designs={"wide": data(wide, 2, 9)}, **options)
+    assert found.verdict == "UNDETERMINED"
+    plan = found.sections["next_measurement"]
+    assert plan["resolves"]
+    assert plan["design"]["design"] == "wide"
+    costs = [one["cost"] for one in plan["ranking"] if one["resolves"]]
+    assert costs == sorted(costs)
+    assert plan["cost_of_all_again"] is None or plan["cost"] <= plan["cost_of_all_again"] / 5
+    new = data(np.repeat(wide[np.atleast_1d(plan["design"]["row"])], plan["repeats"]), 2, 4)
+    both = {name: jnp.concatenate([before[name], new[name]]) for name in before}
+    after = diagnose(line, both, EFFECTS, **options)
+    assert after.verdict == "LISTED"
+    assert after.causes[0].effects == ("bend_2",)
+
+
+def many(x, group, y=None):
+    """A level for each group."""
+    level = numpyro.sample("a", dist.Normal(0.0, 2.0).expand([x.shape[0] // 4]))
+    with numpyro.plate("row", len(x)):
+        mean = numpyro.deterministic("mean", level[group])
+        numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+def test_designs_of_other_parameters_are_refused():
+    def rows(n):
+        return {"x": jnp.ones(n), "group": jnp.zeros(n, int), "y": jnp.ones(n)}
+
+    names = [effect.name for effect in EFFECTS]
+    here, there = (Problem(many, rows(n), EFFECTS).with_live(names) for n in (16, 8))
+    fits = [fitting.fit(here, here.null(), [name]) for name in names]
+    with pytest.raises(InputError, match="the 5 shared parameters of the fit, got 3"):
+        designs_of(there, here, fits, "fewer")

@@ -1,0 +1,387 @@
+"""Whitened rows: mean, covariance, score and information of every family against its density."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+from scipy import stats
+
+from dtprob.effects.distributions import ComplexStudentT
+from dtprob.errors import InputError
+from dtprob.gap.observation import discrete, whiten
+from dtprob.gap.observation.likelihoods import LIKELIHOODS
+from dtprob.models.complex_normal import ComplexNormal
+
+
+def strong(value):
+    """An array whose dtype, unlike a Python number's, wins over single precision."""
+    return jnp.asarray(np.asarray(value))
+
+
+LOGITS = jnp.array([0.3, -1.2, 0.8])
+PROBABILITY = jax.nn.softmax(LOGITS)
+
+# (family, make distribution, parameters, tangent)
+FAMILIES = {
+    "ComplexNormal": (
+        ComplexNormal,
+        {"loc": strong(0.4 - 1.1j), "variance": strong(1.7)},
+        {"loc": strong(0.6 + 0.9j), "variance": strong(-0.8)},
+    ),
+    "ComplexStudentT": (
+        ComplexStudentT,
+        {"loc": strong(0.4 - 1.1j), "variance": strong(1.7), "tail": strong(0.0)},
+        {"loc": strong(0.6 + 0.9j), "variance": strong(-0.8), "tail": strong(0.5)},
+    ),
+    "Normal": (
+        dist.Normal,
+        {"loc": strong(-0.3), "scale": strong(0.6)},
+        {"loc": strong(0.7), "scale": strong(0.4)},
+    ),
+    "LogNormal": (
+        dist.LogNormal,
+        {"loc": strong(-0.3), "scale": strong(0.6)},
+        {"loc": strong(0.7), "scale": strong(0.4)},
+    ),
+    "StudentT": (
+        lambda loc, scale, df: dist.StudentT(df, loc, scale),
+        {"loc": strong(-0.3), "scale": strong(0.6), "df": strong(5.0)},
+        {"loc": strong(0.7), "scale": strong(0.4), "df": strong(0.0)},
+    ),
+    "BernoulliLogits": (
+        lambda logits: dist.Bernoulli(logits=logits),
+        {"logits": strong(0.9)},
+        {"logits": strong(0.7)},
+    ),
+    "BernoulliProbs": (
+        lambda probs: dist.Bernoulli(probs=probs),
+        {"probs": strong(0.8)},
+        {"probs": strong(0.3)},
+    ),
+    "Poisson": (dist.Poisson, {"rate": strong(2.3)}, {"rate": strong(0.6)}),
+    "Laplace": (
+        dist.Laplace,
+        {"loc": strong(-0.3), "scale": strong(0.6)},
+        {"loc": strong(0.7), "scale": strong(0.4)},
+    ),
+    "MultivariateNormal": (
+        lambda loc, scale_tril: dist.MultivariateNormal(loc, scale_tril=scale_tril),
+        {"loc": strong([0.4, -1.0, 0.2, 0.1]), "scale_tril": strong(np.tri(4) * [0.7, 0.5, 0.9, 1.2])},
+        {
+            "loc": strong([0.5, 0.3, -0.4, 0.2]),
+            "scale_tril": strong(np.tri(4) * [[0.2], [-0.3], [0.6], [0.1]]),
+        },
+    ),
+    "Exponential": (dist.Exponential, {"rate": strong(2.3)}, {"rate": strong(0.6)}),
+    "Gamma": (
+        dist.Gamma,
+        {"concentration": strong(1.8), "rate": strong(0.7)},
+        {"concentration": strong(0.5), "rate": strong(-0.4)},
+    ),
+    "Weibull": (
+        dist.Weibull,
+        {"scale": strong(1.8), "concentration": strong(2.4)},
+        {"scale": strong(0.5), "concentration": strong(-0.4)},
+    ),
+    "Beta": (
+        dist.Beta,
+        {"concentration1": strong(3.2), "concentration0": strong(0.8)},
+        {"concentration1": strong(0.5), "concentration0": strong(-0.3)},
+    ),
+    "VonMises": (
+        dist.VonMises,
+        {"loc": strong(2.8), "concentration": strong(3.1)},
+        {"loc": strong(0.4), "concentration": strong(0.7)},
+    ),
+    "GammaPoisson": (
+        dist.GammaPoisson,
+        {"concentration": strong(2.6), "rate": strong(0.1)},
+        {"concentration": strong(0.4), "rate": strong(-0.02)},
+    ),
+    "BinomialLogits": (
+        lambda total_count, logits: dist.Binomial(jnp.asarray(total_count, int), logits=logits),
+        {"total_count": strong(9.0), "logits": strong(0.9)},
+        {"total_count": strong(0.0), "logits": strong(0.7)},
+    ),
+    "BinomialProbs": (
+        lambda total_count, probs: dist.Binomial(jnp.asarray(total_count, int), probs=probs),
+        {"total_count": strong(9.0), "probs": strong(0.8)},
+        {"total_count": strong(0.0), "probs": strong(0.3)},
+    ),
+    "CategoricalLogits": (
+        lambda logits: dist.Categorical(logits=logits),
+        {"logits": LOGITS},
+        {"logits": jnp.array([0.5, -0.2, 0.4])},
+    ),
+    "CategoricalProbs": (
+        lambda probs: dist.Categorical(probs=probs),
+        {"probs": PROBABILITY},
+        {"probs": jnp.array([0.3, -0.1, -0.2])},
+    ),
+}
+COUNT = 100_000
+
+
+def draws(family, n=COUNT):
+    make, parameters, _ = FAMILIES[family]
+    return make(**parameters).sample(jax.random.key(3), (n,))
+
+
+def batch(family, values):
+    make, parameters, _ = FAMILIES[family]
+    return whiten.observation(make(**each(parameters, values)), values, "y")
+
+
+def each(parameters, values):
+    """The same parameters for every draw."""
+    return {k: jnp.broadcast_to(v, (len(values), *jnp.shape(v))) for k, v in parameters.items()}
+
+
+def tangent_of(family, values):
+    return each(FAMILIES[family][2], values)
+
+
+def expected_covariance(family, size):
+    if family.startswith("Categorical"):  # one row per class; they sum to zero along sqrt(p)
+        root = np.sqrt(np.asarray(PROBABILITY))
+        return np.eye(size) - np.outer(root, root)
+    if family == "MultivariateNormal":  # each product with the opposite entry is there twice, by halves
+        twice = np.tile(np.eye(2), (2, 2)) / 2
+        return np.block([[np.eye(12), np.zeros((12, 4))], [np.zeros((4, 12)), twice]])
+    return np.eye(size)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_residuals_have_mean_zero_and_unit_covariance(family):
+    values = draws(family)
+    rows = np.moveaxis(np.asarray(whiten.residual(batch(family, values), values)), 1, -1).reshape(-1, COUNT)
+    expected = expected_covariance(family, len(rows))
+    fourth = (rows[:, None] ** 2 * rows[None] ** 2).mean(-1)
+    assert np.all(np.abs(rows.mean(1)) < 5 / np.sqrt(COUNT))
+    assert np.all(np.abs(np.cov(rows) - expected) < 5 * np.sqrt(fourth / COUNT) + 1e-9)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_score_is_the_slope_of_the_log_density(family):
+    make, parameters, tangent = FAMILIES[family]
+    values = draws(family, 50)
+    score = jnp.sum(
+        whiten.residual(batch(family, values), values)
+        * whiten.shift(batch(family, values), tangent_of(family, values)),
+        axis=(0, *range(2, values.ndim + 1)),
+    )
+    h = 1e-6 if family != "ComplexStudentT" else 1e-5
+
+    def density(t):
+        moved = {k: v + t * tangent[k] for k, v in parameters.items()}
+        if family == "CategoricalProbs":
+            return jnp.log(moved["probs"])[values]
+        return make(**moved).log_prob(values)
+
+    if family == "ComplexStudentT":  # one-sided in the tail
+        slope = (4 * density(h) - density(2 * h) - 3 * density(0.0)) / (2 * h)
+    else:
+        slope = (density(h) - density(-h)) / (2 * h)
+    np.testing.assert_allclose(score, slope, rtol=2e-5, atol=2e-5)
+
+
+@pytest.mark.parametrize("tail", [0.05, 0.4])
+def test_score_of_heavy_tails_away_from_the_null(tail):
+    parameters = {"loc": strong(0.4 - 1.1j), "variance": strong(1.7), "tail": strong(tail)}
+    tangent = {"loc": strong(0.6 + 0.9j), "variance": strong(-0.8), "tail": strong(0.5)}
+    values = ComplexStudentT(**parameters).sample(jax.random.key(0), (40,))
+    wide = {k: jnp.broadcast_to(v, (40,)) for k, v in parameters.items()}
+    observed = whiten.Observation("ComplexStudentT", wide)
+    moved = {k: jnp.broadcast_to(v, (40,)) for k, v in tangent.items()}
+    score = jnp.sum(whiten.residual(observed, values) * whiten.shift(observed, moved), axis=0)
+
+    def density(t):
+        return ComplexStudentT(**{k: v + t * tangent[k] for k, v in parameters.items()}).log_prob(values)
+
+    np.testing.assert_allclose(score, jax.jacfwd(density)(0.0), rtol=1e-8, atol=1e-8)
+
+
+@pytest.mark.parametrize("tail", [0.0, 0.2])
+def test_fisher_of_location_and_variance_under_heavy_tails(tail):
+    parameters = {"loc": strong(0.4 - 1.1j), "variance": strong(1.7), "tail": strong(tail)}
+    values = ComplexStudentT(**parameters).sample(jax.random.key(5), (COUNT,))
+    wide = {k: jnp.broadcast_to(v, values.shape) for k, v in parameters.items()}
+    rows = np.asarray(whiten.residual(whiten.Observation("ComplexStudentT", wide), values))[:3]
+    fourth = (rows[:, None] ** 2 * rows[None] ** 2).mean(-1)
+    assert np.all(np.abs(np.cov(rows) - np.eye(3)) < 5 * np.sqrt(fourth / COUNT))
+
+
+@pytest.mark.parametrize("family", ["ComplexNormal", "StudentT", "CategoricalLogits"])
+def test_information_is_the_variance_of_the_score(family):
+    make, parameters, tangent = FAMILIES[family]
+    values = draws(family, COUNT)
+    one = values[:1]
+    shift = np.asarray(whiten.shift(batch(family, one), tangent_of(family, one)))[:, 0]
+    information = float(shift @ shift)
+    score = np.asarray(
+        jnp.sum(
+            whiten.residual(batch(family, values), values) * jnp.asarray(shift).reshape(-1, 1),
+            axis=0,
+        )
+    )
+    spread = 5 * np.sqrt((score**4).mean() / COUNT)
+    assert abs(score.var() - information) < spread
+    if family not in ("ComplexStudentT", "CategoricalProbs"):  # minus the mean curvature, by differentiation
+
+        def density(t):
+            return jnp.mean(make(**{k: v + t * tangent[k] for k, v in parameters.items()}).log_prob(values))
+
+        curvature = -float(jax.grad(jax.grad(density))(0.0))
+        assert abs(curvature - information) < max(0.02 * information, spread)
+
+
+def test_masked_entries_say_nothing():
+    value = jnp.arange(4.0)
+    mask = jnp.array([True, False, True, False])
+    fn = dist.Normal(jnp.zeros(4), 2.0).mask(mask).to_event(1)
+    observed = whiten.observation(fn, value, "y")
+    rows = whiten.residual(observed, value)
+    shift = whiten.shift(observed, {"loc": jnp.ones(4), "scale": jnp.ones(4)})
+    density = whiten.log_prob(observed, value)
+    assert np.all(np.asarray(rows)[:, ~np.asarray(mask)] == 0)
+    assert np.all(np.asarray(shift)[:, ~np.asarray(mask)] == 0)
+    np.testing.assert_allclose(density.sum(), fn.log_prob(value), rtol=1e-12)
+
+
+def test_wrappers_are_looked_through():
+    value = jnp.zeros((3, 2))
+    fn = dist.Normal(jnp.array([1.0, 2.0]), 0.5).expand((3, 2)).to_event(2)
+    observed = whiten.observation(fn, value, "y")
+    assert observed.family == "Normal"
+    np.testing.assert_allclose(observed.parameters["loc"], [[1.0, 2.0]] * 3)
+    np.testing.assert_allclose(whiten.log_prob(observed, value).sum(), fn.log_prob(value), rtol=1e-12)
+
+
+def test_samples_follow_the_observation():
+    observed = whiten.Observation("Poisson", {"rate": jnp.full(20_000, 3.0)})
+    values = whiten.sample(observed, jax.random.key(0))
+    assert abs(float(values.mean()) - 3.0) < 5 * np.sqrt(3.0 / 20_000)
+
+
+def test_unknown_distribution_is_refused_by_name():
+    others = [
+        dist.BetaBinomial(2.0, 1.0, 3),
+        dist.InverseGamma(2.0, 1.0),  # made of a gamma, an exponential, a normal
+        dist.Pareto(1.0, 2.0),
+        dist.LeftTruncatedDistribution(dist.Normal(), low=0.0),
+        dist.TransformedDistribution(dist.Normal(), dist.transforms.ExpTransform()),
+    ]
+    for other in others:
+        with pytest.raises(InputError, match=rf"observed site 'y'.*{type(other).__name__}"):
+            whiten.observation(other, jnp.full((), 0.5), "y")
+
+
+def test_information_on_the_spread_of_counts():
+    """Against the sum over all counts."""
+    mean, concentration = (a.ravel() for a in np.meshgrid([0.05, 3.0, 400.0, 3e5], [0.3, 5.0, 200.0]))
+    p = {"concentration": strong(concentration), "rate": strong(concentration / mean)}
+    found = np.asarray(jax.jit(discrete.counts_spread)(p)) ** 2
+    for m, c, information in zip(mean, concentration, found, strict=True):
+        shape = stats.nbinom(c, c / (c + m))
+        k = np.arange(0.0, int(shape.isf(1e-13)) + 10)
+        whole = np.sum(shape.sf(k) / (c + k) ** 2) - m / (c * (c + m))
+        assert information == pytest.approx(whole, rel=2e-3), (m, c)
+
+
+@pytest.mark.parametrize(
+    "fn",
+    [
+        dist.NegativeBinomial2(4.0, 2.5),
+        dist.NegativeBinomial(5, probs=0.4),
+        dist.NegativeBinomial(5, logits=0.4),
+        dist.BetaProportion(0.7, 12.0),
+        dist.Chi2(3.0),
+    ],
+    ids=lambda fn: type(fn).__name__,
+)
+def test_the_same_distribution_with_other_parameters(fn):
+    value = strong(0.3 if isinstance(fn, dist.Beta) else 3.0)
+    observed = whiten.observation(fn, value, "y")
+    np.testing.assert_allclose(whiten.log_prob(observed, value), fn.log_prob(value), rtol=1e-6)
+
+
+def test_entries_of_a_vector_have_its_density_together():
+    values = draws("MultivariateNormal", 20)
+    make, parameters, _ = FAMILIES["MultivariateNormal"]
+    entries = whiten.log_prob(batch("MultivariateNormal", values), values)
+    assert entries.shape == values.shape
+    np.testing.assert_allclose(entries.sum(-1), make(**parameters).log_prob(values), rtol=1e-10)
+
+
+@pytest.mark.parametrize("size", [1, 2, 3, 5])
+def test_scores_of_vectors_of_any_length(size):
+    rng = np.random.default_rng(size)
+    root = strong(np.tril(0.3 * rng.normal(size=(size, size)), -1) + np.diag(rng.uniform(0.5, 1.5, size)))
+    change = {
+        "loc": strong(rng.normal(size=size)),
+        "scale_tril": strong(np.tril(rng.normal(size=(size, size)))),
+    }
+    value = strong(rng.normal(size=(1, size)))
+    fn = dist.MultivariateNormal(jnp.zeros((1, size)), scale_tril=root)
+    observed = whiten.observation(fn, value, "y")
+    score = jnp.sum(whiten.residual(observed, value) * whiten.shift(observed, each(change, value)))
+
+    def density(t):
+        moved = dist.MultivariateNormal(t * change["loc"], scale_tril=root + t * change["scale_tril"])
+        return moved.log_prob(value[0])
+
+    np.testing.assert_allclose(score, jax.grad(density)(0.0), rtol=1e-8)
+
+
+def test_a_mask_of_whole_vectors():
+    values, mask = draws("MultivariateNormal", 4), jnp.array([True, False, True, False])
+    make, parameters, _ = FAMILIES["MultivariateNormal"]
+    fn = make(**each(parameters, values)).mask(mask)
+    density = whiten.log_prob(whiten.observation(fn, values, "y"), values)
+    np.testing.assert_allclose(density.sum(-1), fn.log_prob(values), rtol=1e-10)
+
+
+MOVES = [
+    (family, spread)
+    for family, known in LIKELIHOODS.items()
+    for spread in (False, True)
+    if (known.respread if spread else known.relocate) is not None
+]
+
+
+@pytest.mark.parametrize(("family", "spread"), MOVES)
+def test_a_move_shifts_one_row_by_its_step(family, spread):
+    observed = batch(family, draws(family, 1))
+    if family == "ComplexStudentT":
+        observed.parameters["tail"] = jnp.full(1, 0.3)
+    like = jnp.zeros(observed.parameters[LIKELIHOODS[family].parameters[0]].shape, float)
+    step = 0.3 + 0.2 * jnp.arange(like.size).reshape(like.shape)
+
+    def parameters(t):
+        found = whiten.moved(observed, t * step, spread=spread)
+        assert found is not None
+        return found.parameters
+
+    rows = np.asarray(whiten.shift(observed, jax.jvp(parameters, (0.0,), (1.0,))[1]))
+    wanted = np.zeros_like(rows)
+    wanted[whiten.location_rows(family, len(rows)) if spread else 0] = step
+    np.testing.assert_allclose(rows, wanted, atol=1e-6)
+
+
+def test_nothing_tried_says_nothing():
+    value = jnp.array([0, 0, 3])
+    for chance in ({"logits": jnp.array([0.3, 800.0, -800.0])}, {"probs": jnp.array([0.3, 0.9, 0.2])}):
+        observed = whiten.observation(dist.Binomial(jnp.array([0, 0, 5]), **chance), value, "y")
+        rows = np.asarray(whiten.residual(observed, value))
+        assert np.all(rows[:, :2] == 0)
+        assert np.all(np.isfinite(rows))
+        assert np.all(np.asarray(whiten.log_prob(observed, value))[:1] == 0)
+
+
+@pytest.mark.parametrize("logit", [-60.0, 60.0])
+def test_certain_bernoulli_stays_finite(logit):
+    value = jnp.array([float(logit > 0)])
+    observed = whiten.observation(dist.Bernoulli(logits=jnp.array([logit])), value, "y")
+    assert np.all(np.isfinite(whiten.residual(observed, value)))
+    assert np.all(np.isfinite(whiten.shift(observed, {"logits": jnp.ones(1)})))

@@ -1,0 +1,199 @@
+"""Site families: patterns are linear and their scores adjoint to what they perturb; curves are what their labels say."""
+
+from functools import partial
+from types import SimpleNamespace
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.where.curves import Quantity, curves, cycles, quantity
+from dtprob.gap.where.families import deterministic, families, observed, shifted
+from tests.unit.gap.examples import bend, draw, line
+
+LENGTH = 40
+
+
+def table(x, street, place, y=None):
+    """A line over rows that lie in streets, at places."""
+    del street, place
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("row", len(x)):
+        mean = numpyro.deterministic("mean", slope * x)
+        numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+def raw(x, y=None):
+    """A line that names no site."""
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(slope * x, 1.0), obs=y)
+
+
+def rows(seed=1):
+    rng = np.random.default_rng(seed)
+    return {
+        "x": jnp.asarray(rng.normal(size=LENGTH)),
+        "street": jnp.asarray(np.repeat(np.arange(5), 8)[rng.permutation(LENGTH)]),
+        "place": jnp.asarray(rng.normal(size=(LENGTH, 2))),
+        "y": jnp.asarray(rng.normal(size=LENGTH)),
+    }
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return Problem(table, rows(), [bend()], "row")
+
+
+def complex_site(problem, shape=(LENGTH, 3), axes=("row", "antenna")):
+    rng = np.random.default_rng(3)
+    value = rng.normal(size=shape) + 1j * rng.normal(size=shape)
+    gradients = rng.normal(size=(4, *shape)) + 1j * rng.normal(size=(4, *shape))
+    return deterministic("gain", axes, value, gradients)
+
+
+@pytest.mark.parametrize("shape", [(LENGTH, 3), (LENGTH, 8)], ids=["short", "rows in order"])
+def test_scores_are_the_slope_along_what_a_family_perturbs(problem, shape):
+    site = complex_site(problem, shape)
+    angle = quantity("angle", site.axes, np.random.default_rng(4).normal(size=shape))
+    seen = set()
+    for family, scores in families(partial(curves, problem), [(angle, tuple(angle.curves()))], site):
+        step = family.step(scores[0], np.ones(scores.shape[1]), site.value)
+        slope = np.real(np.sum(site.gradients * step, axis=(1, 2)))  # d = Re(g dz), as JAX has it
+        np.testing.assert_allclose(slope, scores @ scores[0], rtol=1e-6, atol=1e-9)
+        seen.add(family.kind)
+    assert seen == {
+        "additive",
+        "relative",
+        "conjugate",
+        *(f"from the {side} {axis}" for side in ("next", "last") for axis in ("row", "antenna")),
+    }
+
+
+def test_a_neighbour_leaks_into_an_entry(problem):
+    site = complex_site(problem)
+    found = {family.label: family for family, _ in families(partial(curves, problem), (), site)}
+    step = found["from the next antenna, common"].step(np.array([1.0, 0.0]), np.ones(2), site.value)
+    np.testing.assert_allclose(step, np.roll(site.value, -1, axis=1))
+
+
+def test_curves_are_smooth_ripples_columns_and_groups(problem):
+    given = curves(problem, "row", LENGTH)
+    found = {c.label: c.values for c in given}
+    ripples = [c.values for c in given if c.ripple is not None and c.ripple.over == "row"]
+    waves = np.concatenate([found["smooth in row"], *ripples])
+    np.testing.assert_allclose(waves @ waves.T, LENGTH / 2 * np.eye(LENGTH - 1), atol=1e-9)
+    assert found["by street"].shape == (5, LENGTH)
+    np.testing.assert_array_equal(found["by street"].toarray().sum(0), 1.0)
+    assert {"along x", "along place[0]", "along place[1]", "over place[0] and place[1]"} <= set(found)
+    assert {c.label: c.column for c in given if c.column is not None} == {"by street": "street"}
+    assert not any("y" in name.split()[1:] for name in found)
+    order = np.argsort(np.asarray(problem.data["x"]))
+    assert np.all(np.diff(found["along x"][0][order]) < 0)
+
+
+def test_a_band_of_ripples_is_called_by_its_half_waves(problem):
+    found = {c.label: c for c in curves(problem, "row", LENGTH)}
+    whole = found["ripple in row, 9 to 16 half waves"]
+    band = whole.band(2, 5)
+    assert band.label == "ripple in row, 11 to 13 half waves"
+    np.testing.assert_array_equal(band.values, whole.values[2:5])
+    assert band.band(1, 2).label == "ripple in row, 12 to 12 half waves"
+    with pytest.raises(ValueError, match="no ripple"):
+        found["smooth in row"].band(0, 1)
+
+
+def test_a_column_of_an_axis_name_stands_for_its_positions(problem):
+    place = np.random.default_rng(5).uniform(size=LENGTH)
+    named = SimpleNamespace(declaration=problem.declaration, data={**problem.data, "row": place})
+    labels = [c.label for c in curves(named, "row", LENGTH)]
+    assert len(labels) == len(set(labels))
+    ripple = next(c for c in curves(named, "row", LENGTH) if c.ripple is not None)
+    scaled = (place - place.min()) / np.ptp(place)
+    np.testing.assert_allclose(ripple.values[0], np.cos(5 * np.pi * scaled), atol=1e-12)
+
+
+def test_a_quantity_lies_on_the_axes_along_which_it_varies():
+    values = np.linspace(0, 1, LENGTH)[:, None, None] + np.linspace(0, 3, 4) + np.zeros((LENGTH, 3, 1))
+    found = quantity("delay", ("link", "antenna", "path"), values)
+    assert found.axes == ("link", "path")
+    np.testing.assert_array_equal(found.values, values[:, 0])
+    assert found.kept(("link", "antenna", "path"), (LENGTH, 3, 4)) == (0, 2)
+    assert found.kept(("link", "path"), (LENGTH, 4)) == (0, 1)
+    assert found.kept(("path", "link"), (4, LENGTH)) is None
+    assert found.kept(("link", "path"), (LENGTH, 5)) is None
+    assert found.kept(("link", "antenna"), (LENGTH, 3)) is None
+    unnamed = quantity("level", ("level_dim_0",), np.arange(9.0))
+    assert unnamed.kept(("power_dim_0",), (9,)) == (0,)
+    square = Quantity("phase", ("receiver", "transmitter"), np.ones((4, 4)))
+    assert square.kept(("transmitter", "receiver"), (4, 4)) is None  # as many, but others
+    assert square.kept(("receiver", "power_dim_1"), (4, 4)) == (0, 1)
+    assert quantity("device", ("link",), np.arange(9)) is None
+    assert quantity("height", ("link",), np.array([1.5, 10.0] * 9)) is None
+    assert quantity("gain", ("link",), np.full(9, np.nan)) is None
+
+
+def test_curves_over_a_quantity_are_smooth_in_its_rank_and_ripples_over_its_values():
+    values = np.random.default_rng(0).lognormal(size=(LENGTH, 3))
+    smooth, *ripples = quantity("delay", ("link", "path"), values).curves()
+    order = np.argsort(values.reshape(-1))
+    assert smooth.label == "along delay"
+    assert np.all(np.diff(smooth.values[0][order]) < 0)
+    scaled = (values.reshape(-1) - values.min()) / np.ptp(values)
+    np.testing.assert_allclose(ripples[0].values[1], np.cos(6 * np.pi * scaled), atol=1e-12)
+    assert ripples[-1].label.endswith("to 64 half waves")
+
+
+def test_cycles_of_each_period_take_turns():
+    found = cycles(150, "slot")
+    assert [c.label for c in found] == [f"every {period} along slot" for period in range(2, 7)]
+    for period, one in enumerate(found, start=2):
+        phases = one.values.toarray()
+        np.testing.assert_array_equal(phases.argmax(0), np.arange(150) % period)
+        np.testing.assert_array_equal(phases.sum(0), 1.0)
+    assert cycles(47, "slot") == ()
+
+
+def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
+    value = np.zeros((21, 8, 2))
+    value.reshape(168, 2)[::7, 1] = 1.0
+    site = deterministic("load", ("window", "slot", "device"), np.zeros(value.shape), value[None])
+    found = {f.label: (f, s) for f, s in families(partial(curves, problem), (), site)}
+    family, scores = found["additive, every 7 along window and slot"]
+    assert np.count_nonzero(scores) == 1
+    step = family.step(scores[0], np.full(scores.shape[1], 24.0), site.value)
+    np.testing.assert_allclose(step, value, atol=1e-12)
+
+
+def test_short_axes_have_no_curves(problem):
+    assert curves(problem, "antenna", 5) == ()
+
+
+def test_the_spread_of_an_observation_is_a_site(problem):
+    x = problem.null()
+    sites = list(observed(problem, problem.compiled.residual(x)[None]))
+    assert [(s.name, list(s.kinds)) for s in sites] == [("y", ["spread"])]
+    y = np.asarray(problem.data["y"])
+    np.testing.assert_allclose(sites[0].gradients[0], (y**2 - 1) / np.sqrt(2), rtol=1e-5)
+    step = np.random.default_rng(0).normal(size=(1, LENGTH))
+    moved = problem.rows.unstack(np.asarray(shifted(problem, x, sites[0], step)))
+    np.testing.assert_allclose(moved[0], np.concatenate([np.zeros(LENGTH), step[0]]), rtol=1e-6)
+
+
+def test_where_no_site_is_named_the_observations_locations_are_tested():
+    problem = Problem(raw, {n: rows()[n] for n in ("x", "y")}, [], "row")
+    sites = list(observed(problem, problem.compiled.residual(problem.null())[None]))
+    assert [list(s.kinds) for s in sites] == [["location"], ["spread"]]
+    y = np.asarray(problem.data["y"])
+    np.testing.assert_allclose(sites[0].gradients[0], y, rtol=1e-5)
+
+
+def test_rows_go_back_to_where_they_were_observed():
+    problem = Problem(line, draw("line"), [bend()])
+    flat = np.arange(2.0 * 12 * 8)
+    values = {"y": jnp.asarray(flat.reshape(2, 12, 8))}
+    np.testing.assert_array_equal(problem.rows.unstack(np.asarray(problem.rows.stack(values))), flat)
+    assert SimpleNamespace(**problem.located).y == 1

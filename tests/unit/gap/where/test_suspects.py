@@ -1,0 +1,43 @@
+"""What a wrong site may vary like: ripples narrowed to the half waves that bring the evidence."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dtprob.gap.where.curves import curves
+from dtprob.gap.where.families import Family, Pattern
+from dtprob.gap.where.family_test import FamilyTest
+from dtprob.gap.where.suspects import suspects
+
+N_ROW = 240
+RIPPLE = "ripple in row, 33 to 64 half waves"
+SITE = SimpleNamespace(name="mean", rows=None)
+
+
+@pytest.fixture(scope="module")
+def ripples():
+    """The band of ripples along 240 rows without columns."""
+    problem = SimpleNamespace(declaration=SimpleNamespace(observed={}), data={})
+    return next(c for c in curves(problem, "row", N_ROW) if c.label == RIPPLE)
+
+
+def family_of(found):
+    return Family("additive", Pattern(found.label, (0,), found), np.ones(()))
+
+
+def test_a_ripple_is_narrowed_to_the_half_waves_that_bring_the_evidence(ripples):
+    """Of 32 scores of unit variance one is 8: its band alone has more evidence than all together."""
+    scores = np.random.default_rng(0).normal(size=(9, 32))
+    scores[0, 5] = 8.0
+    found = suspects(SITE, [FamilyTest(family_of(ripples), 0.0, np.ones(9), scores, np.ones(32))])
+    assert [s.family.pattern.label for s in found] == ["ripple in row, 38 to 38 half waves", RIPPLE]
+    np.testing.assert_array_equal(found[0].family.pattern.curves.values, ripples.values[5:6])
+    exact = 0.5 * (64 - 1 - np.log(64)) - np.log(32 + 31 + 29 + 25 + 17)
+    assert found[0].evidence == pytest.approx(exact, abs=0.1)
+
+
+def test_a_band_of_one_half_wave_is_left_as_it_is(ripples):
+    one = family_of(ripples.band(0, 1))
+    found = suspects(SITE, [FamilyTest(one, 0.0, np.ones(9), np.full((9, 1), 5.0), np.ones(1))])
+    assert [s.family for s in found] == [one]

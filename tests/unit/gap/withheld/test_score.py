@@ -1,0 +1,190 @@
+"""Scores of withheld cases."""
+
+import pytest
+from scipy import stats
+
+from dtprob.errors import InputError
+from dtprob.gap.withheld.answers import Answer
+from dtprob.gap.withheld.rates import Rate
+from dtprob.gap.withheld.score import score
+from dtprob.gap.withheld.truths import PARAMETERS, SITES
+from dtprob.physical import custom_cases, draws, labels_cases
+from dtprob.physical.multi_access import faults
+from dtprob.report.score_page import render_score
+
+
+def report(verdict, *effects, classes=(), fraction=0.9):
+    cause = {
+        "effects": list(effects),
+        "alias_class": [list(c) for c in classes] or [list(effects)],
+        "probability": 0.95,
+        "closed_fraction": {"mean": fraction, "low": 0.8, "high": 1.0},
+    }
+    return {"verdict": verdict, "causes": [cause] if effects else []}
+
+
+def case(name, kind, *effects, size=100.0):
+    return {"name": name, "kind": kind, "lambda": size, "effects": [{"name": e} for e in effects]}
+
+
+KEY = {
+    "cases": [
+        case("0000", "null"),
+        case("0001", "null"),
+        case("0002", "listed", "blockage[arrival_0]"),
+        case("0003", "listed", "doppler"),
+        case("0004", "pair", "doppler", "shadowing", size=25.0),
+        case("0005", "unlisted", "pedestrian"),
+        case("0006", "listed", "doppler"),
+        case("0007", "listed", "doppler"),
+    ]
+}
+REPORTS = {
+    "0000": report("NO_GAP"),
+    "0001": report("LISTED", "doppler"),
+    "0002": report(
+        "LISTED", "blockage[arrival_45]", classes=[("blockage[arrival_45]",), ("blockage[arrival_0]",)]
+    ),
+    "0003": report("LISTED", "doppler"),
+    "0004": report("LISTED_WITH_REMAINDER", "shadowing", "doppler"),
+    "0005": report("UNLISTED"),
+    "0006": None,
+}
+
+
+@pytest.fixture(scope="module")
+def scored():
+    return score(KEY, REPORTS)
+
+
+def rate(scored, kind, name):
+    stratum = next(s for s in scored["strata"] if s["kind"] == kind)
+    return stratum["rates"][name]["count"], stratum["rates"][name]["of"]
+
+
+def test_counts_per_stratum(scored):
+    assert rate(scored, "null", "alarm") == (1, 2)
+    assert rate(scored, "listed", "right effect first") == (1, 3)
+    assert rate(scored, "listed", "right family first") == (2, 3)
+    assert rate(scored, "listed", "truth in the class") == (2, 3)
+    assert rate(scored, "pair", "right effect first") == (1, 1)
+    assert rate(scored, "unlisted", "says unlisted") == (1, 1)
+    assert scored["missing"] == ["0007"]
+    assert next(s for s in scored["strata"] if s["kind"] == "listed")["verdicts"] == {
+        "FAILED": 1,
+        "LISTED": 2,
+    }
+
+
+@pytest.mark.parametrize(("count", "of"), [(0, 40), (1, 40), (39, 40), (40, 40), (3, 7)])
+def test_intervals_are_exact(count, of):
+    """Each limit is the probability at which so few, or so many, have a chance of 2.5%."""
+    low, high = Rate(count, of).interval
+    assert low == 0 if count == 0 else stats.binom.sf(count - 1, of, low) == pytest.approx(0.025)
+    assert high == 1 if count == of else stats.binom.cdf(count, of, high) == pytest.approx(0.025)
+
+
+def test_the_page_tells_every_case(scored):
+    page = render_score(scored)
+    assert all(f">{name}<" in page for name in REPORTS)
+    assert "Without an answer: 0007." in page
+    assert "<script" not in page
+    assert "http:" not in page
+    assert "https:" not in page
+
+
+def answered(track, true, *, named=(), size=None, sites=(), shares=(), fraction=None, kind="listed"):
+    """An answer with sizes, sites and a closed fraction."""
+    size = {"c": {"low": size[0], "high": size[1]}} if size else {}
+    cause = {"effects": list(named), "alias_class": [list(named)], "size": size, "closed_fraction": fraction}
+    said = {
+        "verdict": "LISTED" if named else "UNLISTED",
+        "causes": [cause] if named else [],
+        "unlisted": {"sites": list(sites)},
+        "where": {"sites": [{"site": site} for site in shares]},
+    }
+    return Answer(track, {"kind": kind, "lambda": 100.0, "effects": list(true)}, said, None)
+
+
+def true(name, size=1.0, information=100.0):
+    return {"name": name, "family": name.split("[")[0], "size": size, "lambda": information}
+
+
+def test_sizes_are_compared_where_truth_and_library_speak_of_the_same():
+    wall = [true("wall[river]", 7.6)]
+    assert answered("custom", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == [True]
+    assert answered("custom", wall, named=["wall[river]"], size=(8.0, 9.0)).covered_size() == [False]
+    assert answered("custom", wall, named=["wall[railway]"], size=(7.0, 8.0)).covered_size() == []
+    assert answered("network", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == []
+    jump = [true("handover", 3.0)]  # the key does not tell the sign
+    assert answered("custom", jump, named=["handover"], size=(-3.5, -2.5)).covered_size() == [True]
+    gain = [true("gain_offset", 20 * 0.1 / 2.302585093)]  # decibels in truth, nepers in the library
+    assert answered("channel", gain, named=["gain_offset"], size=(0.0999, 0.1001)).covered_size() == [True]
+
+
+def test_a_right_answer_can_close_what_estimating_its_parameters_does_not_cost():
+    """One parameter from three quarters of data with lambda 100: 1 - 4 / 3 / 100."""
+    for low, expected in ((0.98, True), (0.99, False)):
+        fraction = {"mean": 0.99, "low": low, "high": 1.0}
+        said = answered("custom", [true("wall")], named=["wall"], size=(0, 1), fraction=fraction)
+        assert said.covered_fraction() == [expected]
+    assert answered("custom", [true("wall")], named=["sector"], fraction=fraction).covered_fraction() == []
+
+
+def test_the_first_site_is_that_of_the_remainder_or_else_of_the_map():
+    gusts = [true("gusts")]
+    shares = ["expected_power", "deviation"]
+    assert answered("custom", gusts, sites=["deviation"], shares=shares).right_site() == [True]
+    assert answered("custom", gusts, shares=shares).right_site() == [False]
+    assert answered("custom", [true("unheard_of")], shares=shares).right_site() == []
+
+
+def test_named_effects_are_counted_one_by_one():
+    said = answered("custom", [true("wall"), true("sector")], named=["wall", "gain_drift", "second_slope"])
+    assert sorted(said.wrong_names()) == [False, True, True]
+
+
+def test_every_family_of_every_track_has_its_sites():
+    families = {
+        "channel": draws.FAMILIES,
+        "network": faults.FAMILIES,
+        "labels": labels_cases.FAMILIES,
+        "custom": custom_cases.FAMILIES,
+    }
+    assert {track: set(known) for track, known in SITES.items()} == {t: set(f) for t, f in families.items()}
+    assert all(set(PARAMETERS[track]) <= set(SITES[track]) for track in SITES)
+
+
+def test_rivals_stand_beside_each_stratum():
+    rivals = {
+        "0001": {"lasso": {**report("NO_GAP"), "seconds": 2.0}},
+        "0003": {"lasso": {**report("LISTED", "doppler"), "seconds": 4.0}},
+    }
+    found = score(KEY, REPORTS, rivals, {"0003": 7.0})
+    strata = {stratum["kind"]: stratum for stratum in found["strata"]}
+    assert strata["null"]["rivals"]["lasso"]["rates"]["alarm"]["of"] == 1
+    assert strata["listed"]["rivals"]["lasso"]["rates"]["right effect first"]["rate"] == 1.0
+    assert strata["listed"]["rivals"]["lasso"]["seconds"]["median"] == 4.0
+    assert strata["listed"]["seconds"]["median"] == 7.0
+    assert strata["unlisted"]["rivals"] == {}
+    assert ">lasso<" in render_score(found)
+
+
+def test_targets_are_counted_over_the_strata_that_they_speak_of():
+    found = {line["name"]: line for line in score(KEY, REPORTS)["targets"]}
+    assert (found["right effect first"]["count"], found["right effect first"]["of"]) == (1, 3)
+    assert (found["alarm without a gap"]["count"], found["alarm without a gap"]["of"]) == (1, 2)
+    assert "exact set of two" not in found  # the only pair carries too little information
+    assert (found["called unlisted and is not"]["count"], found["called unlisted and is not"]["of"]) == (0, 6)
+    assert (
+        found["closed fraction of .90 or more"]["count"],
+        found["closed fraction of .98 or more"]["count"],
+    ) == (1, 0)
+    assert "Against what is to be reached" in render_score(score(KEY, REPORTS))
+
+
+def test_wrong_keys_and_answers():
+    with pytest.raises(InputError, match=r"key\.json"):
+        score({"cases": [{"name": "a"}]}, {})
+    with pytest.raises(InputError, match="none"):
+        score(KEY, {"9999": None})
