@@ -6,12 +6,14 @@ from collections.abc import Mapping
 from typing import Any, Final
 
 import numpy as np
+import numpyro.distributions as dist
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
-from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.network.laws import (
     ClustersLike,
     clusters_of,
+    from_then_on,
     in_cluster_of,
     joined,
     last_arrival,
@@ -22,28 +24,36 @@ from dtprob.effects.network.laws import (
     thinned,
 )
 
+_WINDOWS: Final = 8
+"""Windows from which on it can be told when in a log a device falls silent."""
 _MOST_PAIRS: Final = 120
 """Pairs of devices in which coupling is looked for; larger networks have none offered."""
 
 
 def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
-    """A device generates fewer packets, or none, and the others go on as before."""
+    """A device generates fewer packets, or none, from some time on, and the others go on as before."""
     clusters = _clusters(sites, data)
     if clusters is None:
         return []
+    lasts = sites["arrival_logits"].shape[0] >= _WINDOWS
+    onset = (Parameter("onset", dist.Normal(0.0, 0.5), is_place=True),) if lasts else ()
     effects: list[Effect] = []
     for device in range(clusters.devices):
 
         def thin(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
-            return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, thinned(v, bit), p["loss"]))
+            loss = p["loss"]
+            if lasts:
+                loss = from_then_on(loss, value.shape[0], p["onset"])[:, None, None, None]
+            return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, thinned(v, bit), loss))
 
         effects.append(
             Effect(
                 "device_disconnected",
                 {"arrival_logits": thin},
-                (half_normal("loss", 3.0),),
+                (half_normal("loss", 3.0), *onset),
                 instance=f"device_{device}",
-                physics=f"Each packet of device {device} is not generated with probability 1 - exp(-loss).",
+                physics=f"Each packet of device {device} is not generated with probability 1 - exp(-loss)"
+                + (", after a share `onset` of the log." if lasts else "."),
                 source="Thinning of the joint arrivals: P(a) of outcomes with the device moves to those without.",
                 requires=("clusters",),
             )

@@ -158,3 +158,14 @@ def _has(joint: Any, clusters: ClustersLike, device: int) -> Float[Array, "episo
 def progress(windows: int) -> Float[np.ndarray, "window 1"]:
     """Place of each window in the log, -1 at its start and 1 at its end."""
     return np.linspace(-1.0, 1.0, windows)[:, None]
+
+
+def from_then_on(amount: Any, windows: int, onset: Any) -> Float[Array, " window"]:
+    """What `mix` takes in each window for an amount that sets in after a share of the log.
+
+    The edge is soft over one window, in what is mixed and not in the amount, so that the time has a derivative and a large
+    amount does not begin earlier.
+    """
+    place = (np.arange(windows) + 0.5) / windows
+    after = (place - onset) * windows
+    return -jnp.logaddexp(jax.nn.log_sigmoid(-after), jax.nn.log_sigmoid(after) - amount)

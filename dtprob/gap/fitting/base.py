@@ -9,6 +9,7 @@ import numpy as np
 
 from dtprob.effects.effect import effects_of
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.marginal import settled
 from dtprob.gap.fitting.soundness import broken
 from dtprob.gap.fitting.sweep import turned
 from dtprob.gap.model.problem import Problem
@@ -59,7 +60,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     freed: list[fitting.Fit] = []
     for fitted in found[:polished]:
         freed.append(polish(problem, fitted, freed=freed))
-    best = fitting.settled(problem, max([*freed, *found[polished:]], key=lambda f: f.log_posterior))
+    best = settled(problem, max([*freed, *found[polished:]], key=lambda f: f.log_posterior))
     return polish(problem, best, added) if added and not polished else best
 
 

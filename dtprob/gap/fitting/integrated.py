@@ -16,7 +16,9 @@ import numpy as np
 
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.base import fit_base
-from dtprob.gap.fitting.fit import Fit, fit, own_mode, terms_of
+from dtprob.gap.fitting.density import terms_of
+from dtprob.gap.fitting.fit import Fit, fit
+from dtprob.gap.fitting.marginal import own_mode
 from dtprob.gap.fitting.sweep import turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.volume import Volume

@@ -56,7 +56,7 @@ def mixing_gain(
         covariance: of the parameters given the data, under the prior at its largest scale.
         estimate: the posterior mode less the null.
         scale: the prior's standard deviations.
-        one_sided: of a single parameter that cannot be below its null.
+        one_sided: of a single size that cannot be below its null.
         places: parameters whose prior is not mixed; none by default.
     """
     precision = np.linalg.inv(covariance / np.outer(scale, scale))
@@ -64,7 +64,7 @@ def mixing_gain(
     unit, score = np.ones(len(scale)), precision @ (estimate / scale)
     shares = np.array([*SCALES, 1.0])
     if places is not None and places.any():
-        terms = _terms_with_places(information, score, shares, places)
+        terms = _terms_with_places(information, score, shares, places, one_sided)
     else:
         terms = _terms(information, score, unit, shares, one_sided)
     return float(special.logsumexp(terms[:-1]) - np.log(len(SCALES)) - terms[-1])
@@ -85,14 +85,19 @@ def _terms(
 
 
 def _terms_with_places(
-    information: np.ndarray, score: np.ndarray, shares: np.ndarray, places: np.ndarray
+    information: np.ndarray, score: np.ndarray, shares: np.ndarray, places: np.ndarray, one_sided: bool
 ) -> np.ndarray:
     """The log Bayes factor at each share of the prior's scale, here 1, that of places left as it is."""
     scale = np.where(places, 1.0, shares[:, None])
     spread = np.eye(len(score)) + scale[:, :, None] * information * scale[:, None, :]
     u = scale * score
-    gained = np.einsum("si,si->s", u, np.linalg.solve(spread, u[..., None])[..., 0])
-    return 0.5 * (gained - np.linalg.slogdet(spread)[1])
+    mean = np.linalg.solve(spread, u[..., None])[..., 0]
+    terms = 0.5 * (np.einsum("si,si->s", u, mean) - np.linalg.slogdet(spread)[1])
+    if one_sided:
+        size = int(np.flatnonzero(~places)[0])
+        above = mean[:, size] / np.sqrt(np.linalg.inv(spread)[:, size, size])
+        terms = terms + np.log(2.0) + special.log_ndtr(above)
+    return terms
 
 
 def prior_scale(prior: object) -> np.ndarray:
@@ -122,6 +127,12 @@ def sides(effect: Effect) -> Bool[np.ndarray, " n"]:
 def places(effect: Effect) -> Bool[np.ndarray, " n"]:
     """Which of an effect's parameters say where it acts, flat."""
     return _flat(effect, [p.is_place for p in effect.parameters])
+
+
+def is_one_sided(effect: Effect) -> bool:
+    """Whether an effect has a single size, which cannot be below its null, and else only places."""
+    sized = ~places(effect)
+    return bool(sized.sum() == 1 and sides(effect)[sized].all())
 
 
 def _flat(effect: Effect, values: Sequence[ArrayLike]) -> np.ndarray:

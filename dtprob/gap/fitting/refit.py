@@ -9,6 +9,7 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import local_maxima, polish
+from dtprob.gap.fitting.marginal import settled
 from dtprob.gap.fitting.plausible import nulls, places, scales, sides
 from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
@@ -39,7 +40,7 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     if effect.kind == "variance":
         return fitting.fit(problem, fitted.x, names)
     best = max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
-    return fitting.settled(problem, best)
+    return settled(problem, best)
 
 
 def polished(

@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike
 from scipy import special
 
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.model.problem import Problem
 
 
@@ -76,7 +77,7 @@ def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
     log_likelihood, error, signal = (np.zeros(problem.n_cluster) for _ in range(3))
     estimates: dict[str, list[np.ndarray]] = {}
     for held, part in folds:
-        log_likelihood[held] = fitting.marginal(problem, part)[held]
+        log_likelihood[held] = marginal(problem, part)[held]
         squares = [np.asarray(v) for v in problem.compiled.prediction_error(part.x)]
         error[held], signal[held] = squares[0][held], squares[1][held]
         for block in (b for name in part.effects for b in problem.blocks_of(name) if not b.local):

@@ -10,25 +10,26 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property
-from typing import Any, cast, final
+from typing import Any, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.effects.effect import FIELD, Context, Effect, Rewriting
+from dtprob.effects.effect import FIELD, Effect
 from dtprob.errors import InputError
 from dtprob.gap.model.compiled import Compiled
+from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import Block, Layout, make_layout, normal_of, transform_of
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.model.rows import Rows, make_rows
-from dtprob.gap.model.running import Arrays, Runner, observations
+from dtprob.gap.model.running import Arrays, Runner
+from dtprob.gap.model.shapes import latent_shapes, observed_shapes, perturbed_sites, shapes_of_fields
 from dtprob.gap.model.volume import Volume
 from dtprob.gap.observation import whiten
 from dtprob.inference.posterior import Sampler
-from dtprob.models.declaration import Data, Declaration, Model, declare, split_static, trace_model
+from dtprob.models.declaration import Data, Declaration, Model, declare, split_static
 
 _REFERENCE_DRAWS = 1000
 _MIDDLE = 2.563
@@ -61,7 +62,8 @@ class Problem:
         self.model, self.data, self.effects = model, dict(data), tuple(effects)
         column = cluster if cluster is not None and cluster in data and np.ndim(data[cluster]) == 1 else None
         self.declaration: Declaration = declare(model, data, cluster=None if column else cluster)
-        self.arrays, self._static = split_static(data)
+        self.arrays, static = split_static(data)
+        self._declared = Declared(model, self.declaration, static)
         self._check_effects()
         self._column = column
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -76,7 +78,7 @@ class Problem:
         """Index rows and coordinates for a set of live effects; nothing is compiled yet."""
         self.__dict__.pop("compiled", None)
         self.live = live
-        shapes, families = self._observed_shapes()
+        shapes, families = observed_shapes(self._declared, self.arrays, self.live)
         self.located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
         joint = [n for n, f in families.items() if whiten.is_joint(f)]
         self.rows: Rows = make_rows(
@@ -84,9 +86,7 @@ class Problem:
         )
         self.layout: Layout = self._make_layout()
         self._runner = Runner(
-            self.model,
-            self.declaration,
-            self._static,
+            self._declared,
             live,
             self.layout,
             self.rows,
@@ -195,7 +195,7 @@ class Problem:
 
         @quick_jit
         def run(arrays: Any) -> dict[str, jax.Array]:
-            trace = trace_model(self.model, eqx.combine(arrays, self._static), jax.random.key(0))
+            trace = self._declared.trace(arrays)
             return {name: jnp.asarray(trace[name]["value"]) for name in self.declaration.observed}
 
         return run(self.arrays)
@@ -207,90 +207,25 @@ class Problem:
     @cached_property
     def float_sites(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Deterministic sites on which a perturbation makes sense, in the largest shape that a candidate gives them."""
-
-        def run(arrays: Any) -> dict[str, Any]:
-            data = eqx.combine(arrays, self._static)
-            grown = dict[str, Any]()
-            while True:  # a site may grow because one before it has
-                found = self._runner.run(jnp.zeros(self.dimension), Arrays(arrays, self.known), grown)
-                values = {n: found.sites[n] for n in self.declaration.deterministic}
-                context = Context(data, found.everything)
-                grown = {n: jnp.zeros(s, values[n].dtype) for n, s in self._largest(values, context).items()}
-                if all(grown[n].shape == values[n].shape for n in values):
-                    return grown
-
-        sites = cast("dict[str, Any]", jax.eval_shape(run, self.arrays))
-        return {n: s for n, s in sites.items() if jnp.issubdtype(s.dtype, jnp.inexact) and s.size}
-
-    def _largest(self, values: Mapping[str, Any], context: Context) -> dict[str, tuple[int, ...]]:
-        """The largest shape that any candidate gives each deterministic site."""
-        shapes = {name: value.shape for name, value in values.items()}
-        for effect in self.effects:
-            parameters = effect.null()
-            if effect.kind == "variance":
-                parameters[FIELD] = jnp.zeros(effect.shape_of_field(values[effect.sites[0]], context))
-            for site, rewrite in effect.rewrites.items():
-                shape = jnp.shape(rewrite(values[site], parameters, context))
-                shapes[site] = np.broadcast_shapes(shapes[site], shape)
-        return shapes
+        return perturbed_sites(self._runner, self.effects, Arrays(self.arrays, self.known))
 
     @cached_property
     def field_shapes(self) -> dict[str, tuple[int, ...]]:
         """Shape of the field of each variance effect."""
         fields = [e for e in self.effects if e.kind == "variance"]
-
-        def run(arrays: Any) -> dict[str, jax.Array]:
-            data = eqx.combine(arrays, self._static)
-            trace = trace_model(self.model, data, jax.random.key(0))
-            context = Context(data, {n: m["value"] for n, m in trace.items()})
-            shapes = {}
-            for effect in fields:
-                value = trace[effect.sites[0]]["value"]
-                grown = self.float_sites.get(effect.sites[0])
-                value = value if grown is None else jnp.broadcast_to(value, grown.shape)
-                shapes[effect.name] = jnp.zeros(effect.shape_of_field(value, context))
-            return shapes
-
-        return {n: tuple(v.shape) for n, v in jax.eval_shape(run, self.arrays).items()}
-
-    def _observed_shapes(self) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
-        families: dict[str, str] = {}
-
-        def run(arrays: Any) -> dict[str, jax.Array]:
-            data = eqx.combine(arrays, self._static)
-            means = [e for e in self.live if e.kind == "mean"]
-            with Rewriting(None, means, {e.name: e.null() for e in means}, data):
-                trace = trace_model(self.model, data, jax.random.key(0))
-            observed = observations(self.declaration, trace)
-            families.update({n: o.family for n, o in observed.items()})
-            return {n: whiten.residual(o, trace[n]["value"]) for n, o in observed.items()}
-
-        shapes = cast("dict[str, Any]", jax.eval_shape(run, self.arrays))
-        return {name: tuple(shapes[name].shape) for name in families}, families
+        return shapes_of_fields(self._declared, self.arrays, fields, self.float_sites)
 
     def _make_layout(self) -> Layout:
-        def run(arrays: Any) -> dict[str, Any]:
-            data = eqx.combine(arrays, self._static)
-            trace = trace_model(self.model, data, jax.random.key(0))
-            return {
-                n: jnp.zeros(transform_of(trace[n]["fn"]).inverse_shape(jnp.shape(trace[n]["value"])))
-                for n in self.declaration.latent
-            }
-
-        shapes = {
-            n: tuple(v.shape) for n, v in cast("dict[str, Any]", jax.eval_shape(run, self.arrays)).items()
-        }
+        shapes = latent_shapes(self._declared, self.arrays)
         entries: list[tuple[str, str | None, tuple[int, ...], tuple[str, ...]]] = []
         for name, site in self.declaration.latent.items():
-            entries.append(
-                (name, None, shapes[name], site.axes if len(site.axes) == len(shapes[name]) else ())
-            )
+            axes = site.axes if len(site.axes) == len(shapes[name]) else ()
+            entries.append((name, None, shapes[name], axes))
         for effect in self.live:
             if effect.kind == "variance":
                 own = (str(self.declaration.cluster),)
-                axes = (
-                    own if effect.name in self.per_cluster else self.declaration.sites[effect.sites[0]].axes
-                )
+                of_site = self.declaration.sites[effect.sites[0]].axes
+                axes = own if effect.name in self.per_cluster else of_site
                 entries.append((effect.site_name(FIELD), effect.name, self.field_shapes[effect.name], axes))
             else:
                 entries += [(effect.site_name(p.name), effect.name, p.shape, ()) for p in effect.parameters]
@@ -308,7 +243,7 @@ class Problem:
 
     def start(self, values: Mapping[str, Any]) -> np.ndarray:
         """The flat vector at constrained values of all latent sites, live effects at their null."""
-        trace = trace_model(self.model, self.data, jax.random.key(0), dict(values))
+        trace = self._declared.trace(self.arrays, given=values)
         x = self.null()
         for name in self.declaration.latent:
             self.layout.put(x, name, transform_of(trace[name]["fn"]).inv(jnp.asarray(values[name])))
@@ -330,7 +265,7 @@ class Problem:
         @quick_jit
         def draw(keys: jax.Array, arrays: Any) -> dict[str, Any]:
             def one(key: jax.Array) -> dict[str, Any]:
-                trace = trace_model(self.model, eqx.combine(arrays, self._static), key)
+                trace = self._declared.trace(arrays, key)
                 return {
                     m: transform_of(trace[m]["fn"]).inv(trace[m]["value"]) for m in self.declaration.latent
                 }
@@ -366,7 +301,7 @@ class Problem:
         names = [b.name for b in self.blocks_of(None) if not b.local and b.name in draws]
 
         def unconstrain(given: Mapping[str, Any], arrays: Any) -> dict[str, Any]:
-            trace = trace_model(self.model, eqx.combine(arrays, self._static), jax.random.key(0), given)
+            trace = self._declared.trace(arrays, given=given)
             return {n: transform_of(trace[n]["fn"]).inv(given[n]).reshape(-1) for n in names}
 
         chosen = {n: jnp.asarray(draws[n]) for n in names}

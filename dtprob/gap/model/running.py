@@ -7,17 +7,17 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple, final
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from numpyro import handlers
 from numpyro.primitives import Messenger
 
 from dtprob.effects.effect import FIELD, Effect, Rewriting
+from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import Layout, fold, transform_of
 from dtprob.gap.model.rows import Rows
 from dtprob.gap.observation import whiten
-from dtprob.models.declaration import Declaration, Model
+from dtprob.models.declaration import Declaration
 
 
 class _Shift(Messenger):
@@ -73,9 +73,7 @@ class Runner:
     """A model with live effects; what of its arguments is an array comes with every call.
 
     Attributes:
-        model: the base model.
-        declaration: its sites.
-        static: its arguments that are no arrays.
+        declared: the base model.
         live: effects whose parameters are coordinates.
         layout: where each latent site and parameter lies in the flat vector.
         rows: the whitened rows of the observations.
@@ -84,9 +82,7 @@ class Runner:
         known: nuisances that earlier data inform instead of the prior.
     """
 
-    model: Model
-    declaration: Declaration
-    static: Any
+    declared: Declared
     live: tuple[Effect, ...]
     layout: Layout
     rows: Rows
@@ -100,8 +96,8 @@ class Runner:
         return jax.jit(self._run)
 
     def _run(self, x: Any, arrays: Arrays, deltas: Mapping[str, Any]) -> Outcome:
-        data = eqx.combine(arrays.data, self.static)
-        latent = {name: self.layout.part(x, name) for name in self.declaration.latent}
+        data, declaration = self.declared.data(arrays.data), self.declared.declaration
+        latent = {name: self.layout.part(x, name) for name in declaration.latent}
         jacobians: dict[str, Any] = {}
 
         def constrain(site: dict[str, Any]) -> Any:
@@ -120,20 +116,20 @@ class Runner:
             handlers.substitute(substitute_fn=constrain),
             handlers.seed(rng_seed=jax.random.key(0)),
         ):
-            self.model(**data)
+            self.declared.model(**data)
         total, local = self._reference_prior(x, arrays.known), jnp.zeros(self.rows.n_cluster)
-        for name in self.declaration.latent:
+        for name in declaration.latent:
             if name in self.known:
                 continue
             fn = trace[name]["fn"]
             density = fn.log_prob(trace[name]["value"]) + fold(jacobians[name], fn.batch_shape)
             if self.layout[name].local:
-                axis = self.declaration.sites[name].axes.index(str(self.declaration.cluster))
+                axis = declaration.sites[name].axes.index(str(declaration.cluster))
                 local = local + jnp.moveaxis(density, axis, 0).reshape(self.rows.n_cluster, -1).sum(1)
             else:
                 total = total + jnp.sum(density)
-        names = [*self.declaration.latent, *self.declaration.deterministic]
-        observed = observations(self.declaration, trace)
+        names = [*declaration.latent, *declaration.deterministic]
+        observed = observations(declaration, trace)
         return Outcome(
             {n: jnp.asarray(trace[n]["value"]) for n in names},
             {n: jnp.asarray(trace[n]["value"]) for n in observed},

@@ -18,7 +18,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.bootstrap import Replicates
-from dtprob.gap.fitting.plausible import log_bayes_factor, scales
+from dtprob.gap.fitting.plausible import is_one_sided, log_bayes_factor, places, scales
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.soundness import UNSEEN
 from dtprob.gap.model.problem import Problem
@@ -136,24 +136,19 @@ class Scores:
     def log_bayes_factor(self) -> np.ndarray:
         """Of each effect, the scale of its prior mixed; see `dtprob.gap.fitting.plausible`."""
         return np.array(
-            [
-                log_bayes_factor(
-                    self.part(k),
-                    self.u[group],
-                    scales(self.effects[k]),
-                    one_sided=_is_one_sided(self.effects[k]),
-                )
-                for k, group in enumerate(self.groups)
-            ]
+            [self._evidence(effect, group) for effect, group in zip(self.effects, self.groups, strict=True)]
         )
+
+    def _evidence(self, effect: Effect, group: np.ndarray) -> float:
+        """Places tell nothing beside the null."""
+        sized = ~places(effect)
+        own = group[sized]
+        information, scale = self.information[np.ix_(own, own)], scales(effect)[sized]
+        return log_bayes_factor(information, self.u[own], scale, one_sided=is_one_sided(effect))
 
     def pairs(self) -> tuple[Pair, ...]:
         """The pairs that explain most together; costly, so made when asked for."""
         return best_pairs(self.effects, self.groups, self.information, self.u, self.log_bayes_factor)
-
-
-def _is_one_sided(effect: Effect) -> bool:
-    return effect.dimension == 1 and effect.parameters[0].is_one_sided
 
 
 def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, found: Tangents) -> Scores:
@@ -206,9 +201,10 @@ def _mean_tests(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not root.shape[1]:
             continue
         t = u[:, group] @ root
-        if len(group) == 1:
-            z[:, k] = t[:, 0] * np.sign(root[0, 0])
-            p[:, k] = stats.norm.sf(z[:, k]) if _is_one_sided(effect) else 2 * stats.norm.sf(np.abs(z[:, k]))
+        sized = np.flatnonzero(~places(effect))
+        if len(sized) == 1:
+            z[:, k] = t[:, 0] * np.sign(root[sized[0], 0])
+            p[:, k] = stats.norm.sf(z[:, k]) if is_one_sided(effect) else 2 * stats.norm.sf(np.abs(z[:, k]))
         else:
             square, d = (t**2).sum(1), root.shape[1]
             log_p = log_gamma_tail(square / 2, d / 2)

@@ -77,6 +77,19 @@ def test_a_disconnected_device_generates_nothing_and_its_neighbour_as_before(off
     np.testing.assert_allclose(half[0, 0, 0], [0.35, 0.45, 0.15, 0.05], atol=1e-9)
 
 
+def test_a_device_falls_silent_part_of_the_way():
+    data = {**records(simulate(40, 0), clusters=CLUSTERS, window=4), "concentration": 1.0}
+    offered = {effect.name: effect for effect in catalogue(declare(multi_access, data).sites, data)}
+    effect = offered["device_disconnected[device_1]"]
+    check_effect(effect, multi_access, data)
+    before = law(data)
+    after = law(data, effect, loss=jnp.array(50.0), onset=jnp.array(0.5))
+    assert len(after) == 10
+    np.testing.assert_allclose(after[0], before[0], atol=0.02)
+    np.testing.assert_allclose(after[-1, 0, 0], [0.6, 0.0, 0.4, 0.0], atol=0.02)
+    np.testing.assert_allclose(after[:, :, 1], before[:, :, 1], atol=1e-12)  # the other cluster
+
+
 def test_the_disconnection_of_the_report(offered, data):
     assert np.array_equal(ARRIVAL, [0.2, 0.4, 0.4, 0.0])
     tables = {**TABLES, "log_arrival": jnp.log(jnp.broadcast_to(ARRIVAL, (2, 1, 4)) + 1e-12)}

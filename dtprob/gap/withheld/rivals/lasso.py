@@ -14,8 +14,9 @@ import numpy as np
 from jaxtyping import Bool, Float
 from scipy import special
 
+from dtprob.gap.fitting.plausible import is_one_sided
 from dtprob.gap.withheld.rivals.claim import Claim
-from dtprob.gap.withheld.rivals.look import Look, chance, is_one_sided
+from dtprob.gap.withheld.rivals.look import Look, chance
 
 _LONGEST = 40
 """Knots of the path that are looked at."""

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.bootstrap import Replicates, replicate
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.plausible import sides
+from dtprob.gap.fitting.plausible import is_one_sided, places
 from dtprob.gap.fitting.projection import Projection, project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -103,11 +103,6 @@ def look(problem: Problem, fitted: Fit, key: jax.Array, settings: Settings) -> L
     )
 
 
-def is_one_sided(effect: Effect) -> bool:
-    """Whether an effect has a single parameter, which cannot be below its null."""
-    return effect.dimension == 1 and bool(sides(effect).all())
-
-
 def chance(statistic: Float[np.ndarray, " n"]) -> float:
     """Exact p-value of the first of exchangeable statistics, large ones against the null."""
     return float(np.mean(statistic >= statistic[0]))
@@ -120,7 +115,7 @@ def _mean_gains(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         root = scores.root(k)
         t = u[:, group] @ root
         if is_one_sided(effect) and root.size:
-            t = np.maximum(t * np.sign(root[0, 0]), 0.0)
+            t = np.maximum(t * np.sign(root[np.flatnonzero(~places(effect))[0], 0]), 0.0)
         gain[:, k], size[k] = 0.5 * (t**2).sum(axis=1), root.shape[1]
     return gain, size
 

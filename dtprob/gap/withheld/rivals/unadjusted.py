@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
+from dtprob.gap.fitting.plausible import is_one_sided, places
 from dtprob.gap.tails import log_gamma_tail
 from dtprob.gap.withheld.rivals.claim import Claim
-from dtprob.gap.withheld.rivals.look import Look, chance, is_one_sided
+from dtprob.gap.withheld.rivals.look import Look, chance
 
 _NOTHING = 1e-9
 
@@ -35,6 +36,8 @@ def _log_p(seen: Look, k: int) -> np.ndarray:
     if not keep.any():
         return np.zeros(len(seen.u))
     t = seen.u[:, group] @ vectors[:, keep] / np.sqrt(values[keep])
-    if is_one_sided(seen.scores.effects[k]):
-        return stats.norm.logsf(t[:, 0] * np.sign(vectors[0, 0]))
+    effect = seen.scores.effects[k]
+    if is_one_sided(effect):
+        size = np.flatnonzero(~places(effect))[0]
+        return stats.norm.logsf(t[:, 0] * np.sign(vectors[size, keep][0]))
     return log_gamma_tail(0.5 * (t**2).sum(axis=1), keep.sum() / 2)

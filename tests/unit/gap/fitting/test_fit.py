@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.newton import positive
 from dtprob.gap.fitting.plausible import SCALES
 from dtprob.gap.model.problem import Problem
@@ -131,7 +132,7 @@ def test_marginal_likelihood_of_each_cluster_is_exact(local):
     covariance = SIGMA**2 * np.eye(x.shape[1]) + 1.0
     slope = fitted.x[problem.layout["b"].offset]
     expected = [stats.multivariate_normal(slope * a, covariance).logpdf(b) for a, b in zip(x, y, strict=True)]
-    np.testing.assert_allclose(fitting.marginal(problem, fitted), expected, rtol=1e-6)
+    np.testing.assert_allclose(marginal(problem, fitted), expected, rtol=1e-6)
 
 
 def test_marginal_does_not_need_the_clusters_coordinates(local):
@@ -139,7 +140,7 @@ def test_marginal_does_not_need_the_clusters_coordinates(local):
     x = fitted.x.copy()
     x[problem.layout["offset"].index] = 5.0
     far = fitting.Fit(**{**fitted.__dict__, "x": x})
-    np.testing.assert_allclose(fitting.marginal(problem, far), fitting.marginal(problem, fitted), atol=2e-3)
+    np.testing.assert_allclose(marginal(problem, far), marginal(problem, fitted), atol=2e-3)
 
 
 def test_marginal_integrates_the_field_of_a_variance_effect():
@@ -152,7 +153,7 @@ def test_marginal_integrates_the_field_of_a_variance_effect():
     a, b = fitted.x[problem.layout["a"].offset], fitted.x[problem.layout["b"].offset]
     covariance = SIGMA**2 * np.eye(x.shape[1]) + sd**2
     expected = [stats.multivariate_normal(a + b * u, covariance).logpdf(v) for u, v in zip(x, y, strict=True)]
-    np.testing.assert_allclose(fitting.marginal(problem, fitted), expected, rtol=1e-6)
+    np.testing.assert_allclose(marginal(problem, fitted), expected, rtol=1e-6)
 
 
 def test_spread_is_the_maximum_of_the_marginal_likelihood():
@@ -177,7 +178,6 @@ def test_clusters_without_weight_leave_the_fit():
     x, y = arrays(data)
     weights = (np.arange(len(x)) % 3 > 0).astype(float)
     used = weights > 0
-    wild = {**data, "y": jnp.where(used[:, None], data["y"], jnp.nan)}
     mean, covariance, evidence = conjugate(
         design(x[used], 1.0, x[used]), y[used].ravel(), [2, 3], SIGMA**2 * np.eye(y[used].size)
     )
@@ -186,7 +186,6 @@ def test_clusters_without_weight_leave_the_fit():
     np.testing.assert_allclose(fitted.x, mean, rtol=1e-6)
     np.testing.assert_allclose(fitted.covariance, covariance, rtol=1e-8)
     np.testing.assert_allclose(fitted.log_evidence, evidence, rtol=1e-9)
-    assert wild["y"].shape == y.shape
 
 
 @pytest.mark.parametrize(

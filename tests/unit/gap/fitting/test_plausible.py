@@ -82,6 +82,18 @@ def test_flat_sizes_of_an_effect():
     np.testing.assert_array_equal(sides(effect), [True, False, False])
 
 
+@pytest.mark.parametrize("estimate", [0.02, 0.5])
+def test_a_size_with_a_place_is_one_sided_as_one_without(estimate):
+    covariance, scale = np.diag([0.3, 0.04]) ** 2, np.array([2.0, 0.5])
+    places = np.array([False, True])
+    both = mixing_gain(covariance, np.array([estimate, 0.2]), scale, one_sided=True, places=places)
+    alone = mixing_gain(covariance[:1, :1], np.array([estimate]), scale[:1], one_sided=True)
+    np.testing.assert_allclose(both, alone, rtol=1e-10)
+    assert mixing_gain(covariance, np.array([estimate, 0.2]), scale, places=places) != pytest.approx(
+        both, abs=0.03
+    )
+
+
 def test_the_prior_of_a_place_is_not_mixed():
     """Where sizes and places say nothing of one another, what is gained is what the sizes alone gain."""
     scale, estimate = np.array([2.0, 0.3, 0.05]), np.array([0.02, 0.1, -0.04])

@@ -10,6 +10,7 @@ import pytest
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.marginal import marginal, settled
 from dtprob.gap.fitting.refit import starting_points
 from dtprob.gap.fitting.sweep import swept, turned
 from dtprob.gap.model.problem import Problem
@@ -66,10 +67,10 @@ def test_every_link_is_freed_from_its_wrong_basin(problem):
     start = problem.start({"scale": 1.0, "phase": np.zeros((5, 1)), "late": np.zeros((5, 1))})
     stuck = fitting.fit(problem, turned(problem, start, problem.compiled.by_cluster))
     assert np.abs(places(problem, stuck.x) - LATE).max() > 0.3
-    free = fitting.settled(problem, stuck)
+    free = settled(problem, stuck)
     np.testing.assert_allclose(places(problem, free.x), LATE, atol=0.06)
     assert free.log_posterior > stuck.log_posterior + 100
-    assert fitting.settled(problem, free) is free
+    assert settled(problem, free) is free
     based = fit_base(problem, jax.random.key(1), polished=0)
     np.testing.assert_allclose(places(problem, based.x), LATE, atol=0.06)
 
@@ -78,8 +79,8 @@ def test_a_link_that_was_left_out_is_judged_at_its_best(problem):
     free = fit_base(problem, jax.random.key(1), polished=0)
     moved = free.x.copy()
     moved[problem.layout["late"].index[0]] += 1.9
-    away = fitting.marginal(problem, fitting.Fit(moved, *list(vars(free).values())[1:]))
-    np.testing.assert_allclose(away, fitting.marginal(problem, free), atol=1e-2)
+    away = marginal(problem, fitting.Fit(moved, *list(vars(free).values())[1:]))
+    np.testing.assert_allclose(away, marginal(problem, free), atol=1e-2)
 
 
 def test_a_sweep_keeps_what_is_best_and_what_is_shared(problem):

@@ -9,6 +9,7 @@ import pytest
 from scipy import stats
 
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.closed import Floor, HeldOut
 from dtprob.gap.model.problem import Problem
@@ -132,5 +133,5 @@ def test_local_coordinates_follow_the_names_of_clusters(order):
     found = problem.compiled.sites(fitted.x)["level"][:, 0]
     np.testing.assert_allclose(found, expected, rtol=1e-5)
     covariance = SIGMA**2 * np.eye(5) + 1.0
-    marginal = [stats.multivariate_normal(np.zeros(5), covariance).logpdf(row) for row in y]
-    np.testing.assert_allclose(fitting.marginal(problem, fitted), marginal, rtol=1e-5)
+    expected = [stats.multivariate_normal(np.zeros(5), covariance).logpdf(row) for row in y]
+    np.testing.assert_allclose(marginal(problem, fitted), expected, rtol=1e-5)

@@ -1,0 +1,84 @@
+"""What a fit maximises: the log posterior of the free coordinates, its terms by cluster, its scores and curvatures."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from dtprob.gap.fitting.active import LOG_2PI, Active, basis, effect_prior
+from dtprob.gap.fitting.newton import NewtonStep, System
+from dtprob.gap.model.problem import Problem
+
+
+def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
+    """What a Gauss-Newton step at x needs: scores and curvatures of the free coordinates."""
+    directions = basis(problem, active)
+    e, w = (np.asarray(part) for part in problem.compiled.linearised(x, directions))
+    prior_gradient, hessian = problem.compiled.prior(x, directions)
+    g_index, l_index = active.global_index, active.local_index
+    n = len(g_index)
+    weighted = np.asarray(active.weights)[:, None]
+    score = (e[:, None, :] @ w)[:, 0]
+    shared, transposed = w[..., :n], np.swapaxes(w, 1, 2)
+    flat = (e.size, n)
+    curvature = (shared * weighted[..., None]).reshape(flat).T @ shared.reshape(flat)
+    cross, local = transposed[:, :n] @ w[..., n:], transposed[:, n:] @ w[..., n:]
+    _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
+    prior_gradient = prior_gradient + effect_gradient
+    curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
+    if problem.volume is not None:
+        base, weights = active.base_index, np.asarray(active.weights)
+        place = np.isin(g_index, base)
+        prior_gradient[base] += weights @ problem.volume.gradient(x[base])
+        curvature[np.ix_(place, place)] -= np.tensordot(weights, problem.volume.bend, 1)
+    cross = cross + np.moveaxis(hessian[:n][:, l_index], 0, 1)
+    local = local + np.moveaxis(hessian[n:][:, l_index], 0, 1)
+    for j in range(l_index.shape[1]):
+        local[:, j, j] += effect_curvature[l_index[:, j]]
+    return System(
+        (weighted * score[:, :n]).sum(0) + prior_gradient[g_index],
+        score[:, n:] + prior_gradient[l_index],
+        curvature,
+        cross,
+        local,
+        np.asarray(active.weights),
+    )
+
+
+def terms_of(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
+    """Log posterior as one global entry followed by one per cluster, without weights."""
+    likelihood, prior, local = problem.compiled.evaluate(x)
+    extra, _, _ = effect_prior(problem, active, x)
+    return np.concatenate([[float(prior) + extra], likelihood + local])
+
+
+def cluster_terms(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
+    """Log likelihood and local prior of each cluster."""
+    terms = terms_of(problem, active, x)[1:]
+    for name, sd in active.spread.items():
+        for block in problem.blocks_of(name):
+            if block.local:
+                w = x[block.index]
+                terms = terms - 0.5 * (w**2).sum(1) / sd**2 - block.size * (np.log(sd) + 0.5 * LOG_2PI)
+    return terms
+
+
+def value_of(problem: Problem, active: Active, x: np.ndarray) -> float:
+    """What a fit maximises."""
+    terms = terms_of(problem, active, x)
+    value = terms[0] + float(active.weights @ np.where(active.weights > 0, terms[1:], 0.0))
+    value += volume_of(problem, active, x)
+    return value if np.isfinite(value) else -np.inf
+
+
+def volume_of(problem: Problem, active: Active, x: np.ndarray) -> float:
+    """What integrating the clusters' own unknowns out adds, where a problem asks for it."""
+    return 0.0 if problem.volume is None else float(active.weights @ problem.volume.at(x[active.base_index]))
+
+
+def moved(active: Active, x: np.ndarray, step: NewtonStep) -> np.ndarray:
+    """The point x after a step."""
+    x = x.copy()
+    x[active.global_index] += step.shared
+    if step.local.size:
+        x[active.local_index] += step.local
+    return x

@@ -1,0 +1,82 @@
+"""Fits whose cluster-local coordinates are at their best anywhere, or integrated out, cluster by cluster."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Final
+
+import numpy as np
+
+from dtprob.gap.fitting.active import LOG_2PI, Active, activate
+from dtprob.gap.fitting.density import cluster_terms, moved, system_at, terms_of
+from dtprob.gap.fitting.fit import Fit, fit
+from dtprob.gap.fitting.newton import local_step, positive
+from dtprob.gap.fitting.sweep import swept
+from dtprob.gap.model.problem import Problem
+
+_ROUNDS: Final = 4
+_GAIN: Final = 0.1
+"""Nats by which a fit has to be better to be another one."""
+
+
+def settled(problem: Problem, fitted: Fit) -> Fit:
+    """The fit, or a better one, none of whose clusters is in a wrong basin of angles and what goes with them; see `swept`.
+
+    Args:
+        problem: the model and candidates on their data.
+        fitted: to all clusters.
+    """
+    for _ in range(_ROUNDS):
+        active = activate(problem, fitted.effects, spread=fitted.spread)
+        terms = partial(cluster_terms, problem, active)
+        x = swept(problem, fitted.x, terms)
+        if x is fitted.x:  # nothing to look for together
+            return fitted
+        if not terms(x).sum() > terms(fitted.x).sum() + _GAIN:
+            return fitted
+        other = fit(problem, x, fitted.effects, spread=fitted.spread)
+        if other.log_posterior < fitted.log_posterior + _GAIN:
+            return fitted
+        fitted = other
+    return fitted
+
+
+def marginal(problem: Problem, fitted: Fit, *, steps: int = 20) -> np.ndarray:
+    """Log marginal likelihood of each cluster (cluster,) given the fit's global coordinates.
+
+    Local coordinates are looked for over their whole range, refitted per cluster and integrated out by Laplace's method, so
+    that clusters that the fit has not seen are judged fairly.
+    """
+    active = activate(problem, fitted.effects, spread=fitted.spread)
+    if not active.local_index.shape[1]:
+        return terms_of(problem, active, fitted.x)[1:]
+    x = swept(problem, fitted.x, partial(cluster_terms, problem, active))
+    x, local = own_mode(problem, active, x, steps=steps)
+    terms = cluster_terms(problem, active, x)
+    return terms + 0.5 * local.shape[-1] * LOG_2PI - 0.5 * np.linalg.slogdet(local)[1]
+
+
+def own_mode(
+    problem: Problem, active: Active, x: np.ndarray, *, steps: int = 20, tolerance: float = 1e-3
+) -> tuple[np.ndarray, np.ndarray]:
+    """The point with each cluster's own coordinates at their mode given the shared ones, and their curvature there.
+
+    Args:
+        problem: the model and candidates on their data.
+        active: which coordinates are free.
+        x: where to start.
+        steps: at most so many Gauss-Newton steps.
+        tolerance: stop when the gain that a step promises, in nats per cluster, falls below.
+    """
+    x, terms, damping = x.copy(), cluster_terms(problem, active, x), np.float64(1e-3)
+    for _ in range(steps):
+        step = local_step(system_at(problem, active, x), float(damping))
+        trial = moved(active, x, step)
+        new = cluster_terms(problem, active, trial)
+        better = new > terms
+        x[active.local_index[better]] = trial[active.local_index[better]]
+        terms = np.where(better, new, terms)
+        damping = damping / 4 if better.all() else damping * 4
+        if step.gain < tolerance * problem.n_cluster:
+            break
+    return x, positive(system_at(problem, active, x).local)

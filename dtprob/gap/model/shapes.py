@@ -1,0 +1,106 @@
+"""Shapes of a model's observations, unknowns and sites, found without computing anything."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from dtprob.effects.effect import FIELD, Context, Effect, Rewriting
+from dtprob.gap.model.declared import Declared
+from dtprob.gap.model.layout import transform_of
+from dtprob.gap.model.running import Arrays, Runner, observations
+from dtprob.gap.observation import whiten
+
+
+def observed_shapes(
+    declared: Declared, arrays: Any, live: Sequence[Effect]
+) -> tuple[dict[str, tuple[int, ...]], dict[str, str]]:
+    """(component, *site shape) of each observed site's whitened rows, and its family, under live effects."""
+    families: dict[str, str] = {}
+    means = [e for e in live if e.kind == "mean"]
+
+    def run(arrays: Any) -> dict[str, jax.Array]:
+        with Rewriting(None, means, {e.name: e.null() for e in means}, declared.data(arrays)):
+            trace = declared.trace(arrays)
+        observed = observations(declared.declaration, trace)
+        families.update({n: o.family for n, o in observed.items()})
+        return {n: whiten.residual(o, trace[n]["value"]) for n, o in observed.items()}
+
+    shapes = _shapes(run, arrays)
+    return {name: shapes[name] for name in families}, families
+
+
+def latent_shapes(declared: Declared, arrays: Any) -> dict[str, tuple[int, ...]]:
+    """Unconstrained shape of each latent site."""
+
+    def run(arrays: Any) -> dict[str, jax.Array]:
+        trace = declared.trace(arrays)
+        return {
+            n: jnp.zeros(transform_of(trace[n]["fn"]).inverse_shape(jnp.shape(trace[n]["value"])))
+            for n in declared.declaration.latent
+        }
+
+    return _shapes(run, arrays)
+
+
+def shapes_of_fields(
+    declared: Declared, arrays: Any, fields: Sequence[Effect], sites: Mapping[str, jax.ShapeDtypeStruct]
+) -> dict[str, tuple[int, ...]]:
+    """Shape of the field of each variance effect, its site in the shape given."""
+
+    def run(arrays: Any) -> dict[str, jax.Array]:
+        trace = declared.trace(arrays)
+        context = Context(declared.data(arrays), {n: m["value"] for n, m in trace.items()})
+        shapes = {}
+        for effect in fields:
+            value, grown = trace[effect.sites[0]]["value"], sites.get(effect.sites[0])
+            value = value if grown is None else jnp.broadcast_to(value, grown.shape)
+            shapes[effect.name] = jnp.zeros(effect.shape_of_field(value, context))
+        return shapes
+
+    return _shapes(run, arrays)
+
+
+def perturbed_sites(
+    runner: Runner, effects: Sequence[Effect], arrays: Arrays
+) -> dict[str, jax.ShapeDtypeStruct]:
+    """Deterministic sites on which a perturbation makes sense, in the largest shape that an effect gives them."""
+    declared = runner.declared
+    names = declared.declaration.deterministic
+
+    def run(arrays: Arrays) -> dict[str, Any]:
+        data, grown = declared.data(arrays.data), dict[str, Any]()
+        while True:  # a site may grow because one before it has
+            found = runner.run(jnp.zeros(runner.layout.dimension), arrays, grown)
+            values = {n: found.sites[n] for n in names}
+            shapes = _largest(effects, values, Context(data, found.everything))
+            grown = {n: jnp.zeros(s, values[n].dtype) for n, s in shapes.items()}
+            if all(grown[n].shape == values[n].shape for n in values):
+                return grown
+
+    sites = cast("dict[str, Any]", jax.eval_shape(run, arrays))
+    return {n: s for n, s in sites.items() if jnp.issubdtype(s.dtype, jnp.inexact) and s.size}
+
+
+def _largest(
+    effects: Sequence[Effect], values: Mapping[str, Any], context: Context
+) -> dict[str, tuple[int, ...]]:
+    """The largest shape that any effect gives each site."""
+    shapes = {name: value.shape for name, value in values.items()}
+    for effect in effects:
+        parameters = effect.null()
+        if effect.kind == "variance":
+            parameters[FIELD] = jnp.zeros(effect.shape_of_field(values[effect.sites[0]], context))
+        for site, rewrite in effect.rewrites.items():
+            shape = jnp.shape(rewrite(values[site], parameters, context))
+            shapes[site] = np.broadcast_shapes(shapes[site], shape)
+    return shapes
+
+
+def _shapes(run: Any, arrays: Any) -> dict[str, tuple[int, ...]]:
+    found = cast("dict[str, Any]", jax.eval_shape(run, arrays))
+    return {name: tuple(value.shape) for name, value in found.items()}
