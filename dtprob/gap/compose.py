@@ -12,7 +12,7 @@ import xarray as xr
 
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
-from dtprob.gap.how_far import closed
+from dtprob.gap.how_far.terms import in_user_terms
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.locate import SiteFinding
 from dtprob.gap.which.screen import Screening
@@ -131,18 +131,14 @@ def _gap(evidence: Evidence) -> dict[str, Any]:
     best = evidence.floor.best
     before = (best - float(evidence.held_before.log_likelihood.sum())) / n
     after = (best - float(evidence.held_after.log_likelihood.sum())) / n if evidence.accepted else None
-    terms: dict[str, Any] = {}
-    problem = evidence.problem
-    error = closed.error_db(problem, evidence.held_before)
-    if error is not None:
-        name = f"{next(iter(problem.declaration.observed))}_{'rmse' if problem.has_powers else 'nmse'}_db"
-        terms[name] = [error, closed.error_db(problem, evidence.held_after) if evidence.accepted else None]
+    held_after = evidence.held_after if evidence.accepted else None
+    terms = in_user_terms(evidence.problem, evidence.held_before, held_after)
     return {
         "unit": "nats per observation",
         "before": before,
         "after": after,
         "floor": [0.0, max((best - evidence.floor.low) / n, 0.0)],
-        "in_user_terms": terms,
+        "in_user_terms": {name: list(pair) for name, pair in terms.items()},
     }
 
 

@@ -19,6 +19,7 @@ from dtprob.gap.fitting.soundness import idle, notes
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
 from dtprob.gap.how_far.shares import shares
+from dtprob.gap.how_far.terms import error_db
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
@@ -190,7 +191,7 @@ def _relevance(evidence: Evidence, settings: Settings) -> float:
 def _negligible(evidence: Evidence, settings: Settings) -> bool:
     """Whether the base model's held-out error is already below what the user cares about."""
     tolerance = settings.tolerance_db
-    error = None if tolerance is None else closed.error_db(evidence.problem, evidence.held_before)
+    error = None if tolerance is None else error_db(evidence.problem, evidence.held_before)
     if tolerance is None or error is None:
         return False
     return error <= (abs(tolerance) if evidence.problem.has_powers else -abs(tolerance))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any, Literal, cast
 
 import equinox as eqx
@@ -35,11 +35,25 @@ _ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
 @dataclass(frozen=True)
+class Measure:
+    """A number that a model's users speak of, such as packets per slot: what is predicted beside what was seen.
+
+    Attributes:
+        site: an observed site, of whose entries it tells.
+        numbers: (values of all sites, data) -> predicted and seen, each of the site's shape or broadcasting to it.
+    """
+
+    site: str
+    numbers: Callable[[Mapping[str, Any], Data], tuple[Any, Any]]
+
+
+@dataclass(frozen=True)
 class Metadata:
-    """What a model's author says beyond the function: axis names per site, coordinates per axis, the cluster axis."""
+    """What a model's author says beyond the function: axis names per site, the cluster axis, and measures by name."""
 
     axes: Mapping[str, tuple[str, ...]]
     cluster: str | None
+    measures: Mapping[str, Measure] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -114,15 +128,21 @@ def base_constraint(support: constraints.Constraint[Any] | None) -> constraints.
 
 
 def model(
-    *, axes: Mapping[str, Sequence[str]] | None = None, cluster: str | None = None
+    *,
+    axes: Mapping[str, Sequence[str]] | None = None,
+    cluster: str | None = None,
+    measures: Mapping[str, Measure] | None = None,
 ) -> Callable[[Model], Model]:
     """Decorator that names what plates cannot: the axes of deterministic and event dimensions.
 
     Args:
         axes: for a site, the names of all its dimensions, first to last.
         cluster: the axis whose entries are independent of one another (a plate's name); by default the first plate.
+        measures: in whose terms a diagnosis tells how large a gap is, beside the errors of observed sites: the root mean
+            square, over clusters, of the mean difference between predicted and seen.
     """
-    metadata = Metadata({name: tuple(names) for name, names in (axes or {}).items()}, cluster)
+    named = {name: tuple(names) for name, names in (axes or {}).items()}
+    metadata = Metadata(named, cluster, dict(measures or {}))
 
     def mark(function: Model) -> Model:
         setattr(function, _METADATA, metadata)

@@ -154,16 +154,26 @@ def significant[Located: (Site, Coordinates)](located: Iterable[Located]) -> lis
 
 def term(name: str) -> str:
     """What a number in the user's own terms is called."""
-    stem = split_unit(name)[0]
-    if stem.endswith("_nmse"):
-        return f"{words(stem.removesuffix('_nmse'))} error (NMSE)"
+    stem = _stem_and_unit(name)[0]
+    for ending, kind in (("_nmse", "NMSE"), ("_rmse", "root mean square")):
+        if stem.endswith(ending):
+            return f"{words(stem.removesuffix(ending))} error ({kind})"
     return words(stem)
+
+
+def _stem_and_unit(name: str) -> tuple[str, str]:
+    """Of `power_db_rmse` as of `power_rmse_db`: what is measured in dBm errs in dB."""
+    stem, ending, _ = name.rpartition("_rmse")
+    inner, unit = split_unit(stem) if ending and name.endswith("_rmse") else ("", "1")
+    if unit == "1":
+        return split_unit(name)
+    return f"{inner}_rmse", "dB" if unit == "dBm" else unit
 
 
 def user_terms(name: str, before: float | None, after: float | None) -> list[str]:
     """Numbers in the user's own terms before and after (where there is an after), in one unit."""
     values = [before] if after is None else [before, after]
-    unit = split_unit(name)[1]
+    unit = _stem_and_unit(name)[1]
     scale = scale_for(values, unit)
     decimals = 1 if unit == "dB" else decimals_between(scale(values[0]), scale(values[-1]))
     return [with_unit(number(scale(value), decimals), scale.unit) for value in values]

@@ -6,7 +6,7 @@ error is not credited to an effect. The interval is a paired bootstrap over clus
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import jax
@@ -16,6 +16,7 @@ from scipy import special
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.marginal import marginal
+from dtprob.gap.model.misses import Miss
 from dtprob.gap.model.problem import Problem
 
 
@@ -25,13 +26,12 @@ class HeldOut:
 
     Attributes:
         log_likelihood: held-out log marginal likelihood of each cluster (cluster,).
-        error, signal: squared prediction error and squared signal of each cluster (cluster,).
+        misses: by how much predictions miss each cluster, by observed site and measure.
         estimates: the effects' parameters in each fold, {site name: (fold, *shape flattened)}.
     """
 
     log_likelihood: np.ndarray
-    error: np.ndarray
-    signal: np.ndarray
+    misses: Mapping[str, Miss]
     estimates: dict[str, np.ndarray]
 
 
@@ -74,15 +74,16 @@ def fold_fits(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> 
 
 def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
     """How fits do on the clusters that each of them has not seen."""
-    log_likelihood, error, signal = (np.zeros(problem.n_cluster) for _ in range(3))
+    log_likelihood, missed = np.zeros(problem.n_cluster), dict[str, Miss]()
     estimates: dict[str, list[np.ndarray]] = {}
     for held, part in folds:
         log_likelihood[held] = marginal(problem, part)[held]
-        squares = [np.asarray(v) for v in problem.compiled.prediction_error(part.x)]
-        error[held], signal[held] = squares[0][held], squares[1][held]
+        for name, miss in problem.compiled.misses(part.x).items():
+            before = missed.get(name, Miss(0.0, 0.0, 0.0))
+            missed[name] = Miss(*(b + np.where(held, m, 0.0) for b, m in zip(before, miss, strict=True)))
         for block in (b for name in part.effects for b in problem.blocks_of(name) if not b.local):
             estimates.setdefault(block.name, []).append(part.x[block.index[0]])
-    return HeldOut(log_likelihood, error, signal, {n: np.stack(v) for n, v in estimates.items()})
+    return HeldOut(log_likelihood, missed, {n: np.stack(v) for n, v in estimates.items()})
 
 
 @dataclass(frozen=True)
@@ -181,12 +182,3 @@ def _gains(before: HeldOut, after: HeldOut, key: jax.Array, draws: int) -> tuple
     gain = after.log_likelihood - before.log_likelihood
     index = np.asarray(jax.random.randint(key, (draws, len(gain)), 0, len(gain)))
     return gain, gain[index].sum(1)
-
-
-def error_db(problem: Problem, result: HeldOut) -> float | None:
-    """Error of the prediction on held-out clusters in dB: normalised mean square, of powers the root mean square."""
-    total = float(result.signal.sum())
-    if total <= 0:
-        return None
-    ratio = max(float(result.error.sum()) / total, 1e-300)
-    return float(np.sqrt(ratio) if problem.has_powers else 10 * np.log10(ratio))

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dtprob.gap.model.misses import Miss, misses
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.model.rows import stacked
 from dtprob.gap.model.running import Arrays, Outcome, Runner
@@ -19,7 +20,6 @@ CHUNK: Final = 16
 """Directions or perturbations that go through a compiled program at a time."""
 _POINTS: Final = 64
 """Points that are evaluated in one run, at most."""
-_DECIBELS = 10.0 / np.log(10.0)
 
 
 @final
@@ -219,17 +219,8 @@ class Compiled:
         @quick_jit
         def state(x: Any, arrays: Any) -> _State:
             found = self._runner.run(x, arrays, {})
-            error, signal = {}, {}
-            for name, o in self._runner.around(found.parameters).items():
-                zero = jnp.zeros(self._runner.shapes[name])
-                squared, power = _squared_error(o, found.values[name])
-                error[name], signal[name] = zero.at[0].set(squared), zero.at[0].set(power)
-            return _State(
-                found.sites,
-                found.parameters,
-                self._runner.rows.stack(error).sum(1),
-                self._runner.rows.stack(signal).sum(1),
-            )
+            data = self._runner.declared.data(arrays.data)
+            return _State(found.sites, found.parameters, misses(self._runner, found, data))
 
         return lambda x: state(jnp.asarray(x), self.arrays)
 
@@ -241,13 +232,9 @@ class Compiled:
         """The observed distributions at x, by site."""
         return self._runner.around(self._state(x).observed)
 
-    def prediction_error(self, x: np.ndarray) -> tuple[jax.Array, jax.Array]:
-        """Squared error and squared signal of each cluster (cluster,), over observations with a location.
-
-        For log-normal observations, as received powers are, the error is in dB and the signal counts entries.
-        """
-        state = self._state(x)
-        return state.error, state.signal
+    def misses(self, x: np.ndarray) -> dict[str, Miss]:
+        """How far predictions at x miss what was seen, by observed site and measure."""
+        return self._state(x).misses
 
     @cached_property
     def prior(self) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
@@ -274,12 +261,11 @@ class Terms(NamedTuple):
 
 
 class _State(NamedTuple):
-    """What a model says at a point: its sites, observed distributions, squared errors and squared signal of clusters."""
+    """What a model says at a point: its sites, its observed distributions, and how far these miss what was seen."""
 
     sites: dict[str, jax.Array]
     observed: dict[str, whiten.Parameters]
-    error: jax.Array
-    signal: jax.Array
+    misses: dict[str, Miss]
 
 
 @partial(jax.jit, static_argnames="families")
@@ -314,16 +300,3 @@ def _chunks(basis: np.ndarray) -> Iterator[jax.Array]:
     padded = np.concatenate([basis, np.zeros((count * CHUNK - len(basis), basis.shape[1]))])
     for start in range(0, len(padded), CHUNK):
         yield jnp.asarray(padded[start : start + CHUNK])
-
-
-def _squared_error(
-    observation: whiten.Observation, value: jax.Array
-) -> tuple[jax.Array | float, jax.Array | float]:
-    """Squared error and squared signal of an observation by entry; none where it has no location."""
-    if "loc" not in observation.parameters:
-        return 0.0, 0.0
-    loc = observation.parameters["loc"]
-    if observation.family == "LogNormal":
-        error = _DECIBELS * (jnp.log(value) - loc)
-        return observation.masked(error**2), observation.masked(jnp.ones_like(error))
-    return observation.masked(jnp.abs(value - loc) ** 2), observation.masked(jnp.abs(value) ** 2)

@@ -180,9 +180,14 @@ class Problem:
         return {name: shape[0] for name, shape in self._runner.shapes.items()}
 
     @property
+    def families(self) -> Mapping[str, str]:
+        """Distribution family of each observed site."""
+        return self._runner.families
+
+    @property
     def has_powers(self) -> bool:
         """Whether all that is observed is log-normal, as received powers are, so that its errors are in dB."""
-        return set(self._runner.families.values()) == {"LogNormal"}
+        return set(self.families.values()) == {"LogNormal"}
 
     @property
     def rows_per_observation(self) -> float:

@@ -8,7 +8,7 @@ Al-Hashimi, arXiv 2212.01351.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Literal, cast
+from typing import Any, Final, Literal, cast
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +17,7 @@ import numpyro
 from jaxtyping import Array, Bool, Float, Int
 
 from dtprob.errors import InputError, unknown_name
-from dtprob.models.declaration import model
+from dtprob.models.declaration import Measure, model
 from dtprob.models.factored import Columns, Factor, draw_factors, log_table, look_up
 from dtprob.models.multi_access.clusters import Clusters
 from dtprob.models.multi_access.transition import lowest
@@ -36,7 +36,28 @@ AXES: Mapping[str, tuple[str, ...]] = {
 }
 
 
-@model(axes=AXES, cluster="episode")
+def _generated(sites: Mapping[str, Any], data: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Packets generated in a slot, all devices together: (episode, slot) each."""
+    clusters = data["clusters"]
+    law = jax.nn.softmax(sites["arrival_logits"])
+    expected = jnp.sum(law * clusters.arrives.sum(axis=1), axis=(-2, -1))
+    return expected, jnp.sum(clusters.decode(sites["arrivals"]), axis=-1)
+
+
+def _delivered(sites: Mapping[str, Any], _: Mapping[str, Any]) -> tuple[Array, Array]:
+    """Packets delivered in a slot: (episode, slot) each."""
+    law = jax.nn.softmax(sites["reception_logits"])
+    return law @ jnp.arange(law.shape[-1]), sites["deliveries"]
+
+
+MEASURES: Final = {
+    "load_error": Measure("deliveries", _generated),
+    "throughput_error": Measure("deliveries", _delivered),
+}
+"""Packets per slot, by window."""
+
+
+@model(axes=AXES, cluster="episode", measures=MEASURES)
 def multi_access(
     sending: Bool[Array, "episode slot device"],
     previous: Int[Array, "episode slot cluster"],

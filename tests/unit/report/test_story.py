@@ -30,6 +30,7 @@ def test_names_become_words() -> None:
     assert names.site_words("arrival") == "directions of arrival"
     assert names.site_words("my_site") == "my site"
     assert names.term("channel_nmse_db") == "channel error (NMSE)"
+    assert names.term("power_dbm_rmse") == names.term("power_rmse_db") == "power error (root mean square)"
 
 
 def test_aliases_leave_the_cause_out() -> None:
@@ -38,6 +39,8 @@ def test_aliases_leave_the_cause_out() -> None:
 
 def test_user_terms_share_unit_and_decimals() -> None:
     assert names.user_terms("throughput", 0.845, 0.912) == ["0.845", "0.912"]
+    assert names.user_terms("power_dbm_rmse", 4.04, 1.2) == ["4.0\u202fdB", "1.2\u202fdB"]
+    assert names.user_terms("label_rmse", 0.5, None) == ["0.500"]
     assert names.user_terms("channel_nmse_db", -3.14, -17.8) == ["−3.1\u202fdB", "−17.8\u202fdB"]
     assert names.user_terms("delay_s", 1e-9, None) == ["1.00\u202fns"]
 

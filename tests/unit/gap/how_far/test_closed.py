@@ -12,13 +12,13 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.closed import Floor, HeldOut
+from dtprob.gap.how_far.terms import error_db, in_user_terms
 from dtprob.gap.model.problem import Problem
 from tests.unit.gap.examples import SIGMA, bend, draw, line
 
 
 def held(log_likelihood):
-    zero = np.zeros(len(log_likelihood))
-    return HeldOut(np.asarray(log_likelihood, float), zero, zero, {})
+    return HeldOut(np.asarray(log_likelihood, float), {}, {})
 
 
 @pytest.mark.parametrize(("n", "parts"), [(12, 4), (13, 4), (4, 8), (5, 1)])
@@ -45,10 +45,10 @@ def test_cross_fit_judges_each_cluster_by_the_others():
         # The fit stops where another step would gain a thousandth of a nat.
         expected = stats.norm(0, SIGMA).logpdf(residual).sum(1)
         np.testing.assert_allclose(found.log_likelihood[out], expected, atol=0.05)
-        np.testing.assert_allclose(found.error[out], (residual**2).sum(1), atol=0.05)
-    np.testing.assert_allclose(
-        closed.error_db(problem, found), 10 * np.log10(found.error.sum() / (y**2).sum()), rtol=1e-9
-    )
+        np.testing.assert_allclose(found.misses["y"].error[out], (residual**2).sum(1), atol=0.05)
+    missed = found.misses["y"].error.sum()
+    np.testing.assert_allclose(error_db(problem, found), 10 * np.log10(missed / (y**2).sum()), rtol=1e-9)
+    np.testing.assert_allclose(in_user_terms(problem, found, None)["y_rmse"][0], np.sqrt(missed / y.size))
 
 
 def test_fraction_of_a_known_gap():
