@@ -20,6 +20,7 @@ from dtprob.effects.network.laws import (
     mix,
     of_device,
     progress,
+    repeated,
     same_arrival,
     thinned,
 )
@@ -106,17 +107,19 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
     for device in range(clusters.devices):
 
         def follow(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], device: int = device) -> Any:
-            last = last_arrival(context, clusters, device) - 0.5
-            return of_device(value, clusters, device, p["log_odds"] * last[..., None])
+            last = last_arrival(context, clusters, device)[..., None]
+            return in_cluster_of(
+                value, clusters, device, lambda v, bit: mix(v, repeated(v, bit, last), p["persistence"])
+            )
 
         effects.append(
             Effect(
                 "bursty_traffic",
                 {"arrival_logits": follow},
-                (normal("log_odds", 1.0),),
+                (half_normal("persistence", 1.0),),
                 instance=f"device_{device}",
-                physics=f"An arrival at device {device} changes the odds of one in the next slot.",
-                source="First-order Markov dependence: P(a_k | the others) tilted by c (a_k[t-1] - 1/2).",
+                physics=f"Device {device} repeats its last slot with probability 1 - exp(-persistence); its load stays.",
+                source="Discrete autoregression of order one (Jacobs and Lewis, J. R. Stat. Soc. B 40 (1978) 94).",
                 requires=("clusters", "previous"),
             )
         )

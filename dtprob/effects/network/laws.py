@@ -91,6 +91,13 @@ def joined(logits: Float[Array, "*batch outcome"], bit: int) -> Float[Array, "*b
     return jnp.where(outcome & bit, p + p[..., outcome ^ bit], 0.0)
 
 
+def repeated(
+    logits: Float[Array, "*batch outcome"], bit: int, last: Float[Array, "*batch"]
+) -> Float[Array, "*batch outcome"]:
+    """Probabilities of joint arrivals when the device of a binary digit does what it did last, 1 for a packet."""
+    return jnp.where(last[..., None] > 0, joined(logits, bit), thinned(logits, bit))
+
+
 def clusters_of(data: Mapping[str, Any]) -> ClustersLike | None:
     """The clusters of a network's data, None where these are other data."""
     found = data.get("clusters")

@@ -77,6 +77,21 @@ def test_a_disconnected_device_generates_nothing_and_its_neighbour_as_before(off
     np.testing.assert_allclose(half[0, 0, 0], [0.35, 0.45, 0.15, 0.05], atol=1e-9)
 
 
+def test_bursts_keep_the_load_of_a_device_and_its_neighbour_as_it_was(offered, data):
+    """Where a device did what it does in a share p of all slots, it does so in a share p of the slots after."""
+    before = law(data)[0, 0, 0]
+    after = law(data, offered["bursty_traffic[device_1]"], persistence=jnp.log(4.0))
+    last = (np.asarray(data["previous"])[..., 0] & 1) > 0
+    given = {bool(value): after[last == value][0, 0] for value in (True, False)}
+    with_ = before[[1, 3]].sum()
+    mean = with_ * given[True] + (1 - with_) * given[False]
+    np.testing.assert_allclose(mean[[1, 3]].sum(), with_, atol=1e-9)
+    for one in given.values():
+        np.testing.assert_allclose(one[[2, 3]].sum(), before[[2, 3]].sum(), atol=1e-9)
+    np.testing.assert_allclose(given[True][[1, 3]].sum(), 0.25 * with_ + 0.75, atol=1e-9)
+    np.testing.assert_allclose(given[False][[1, 3]].sum(), 0.25 * with_, atol=1e-9)
+
+
 def test_a_device_falls_silent_part_of_the_way():
     data = {**records(simulate(40, 0), clusters=CLUSTERS, window=4), "concentration": 1.0}
     offered = {effect.name: effect for effect in catalogue(declare(multi_access, data).sites, data)}
