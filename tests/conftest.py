@@ -18,6 +18,7 @@ import jax  # noqa: E402
 jax.config.update("jax_enable_x64", True)
 
 
+_LEFT_OUT = "jax_disable_most_optimizations"
 _MAPS = Path("/proc/self/maps")
 _MOST_MAPS = 25_000
 """Memory regions of a process after which compiled programs are let go: each takes some, and Linux allows 65,530."""
@@ -30,6 +31,20 @@ def _compiled_programs_are_let_go() -> Iterator[None]:
     if _MAPS.exists() and _MAPS.read_bytes().count(b"\n") > _MOST_MAPS:
         jax.clear_caches()
         gc.collect()
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_quickly(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Most tests compile longer than they run: the compiler leaves most of its passes out, also in processes begun here.
+
+    Statistical tests run longer, and compile as users' programs do.
+    """
+    is_short = "statistical" not in Path(str(request.node.path)).parts
+    with pytest.MonkeyPatch.context() as patch:
+        if is_short:
+            patch.setenv(_LEFT_OUT.upper(), "true")
+        jax.config.update(_LEFT_OUT, is_short)
+        yield
 
 
 @pytest.hookimpl(wrapper=True)

@@ -145,13 +145,14 @@ def test_prior_slopes(case):
     )
 
 
-def test_prediction_error_counts_locations():
+def test_misses_are_sums_over_each_cluster():
     problem = Problem(line, draw("line"), EFFECTS)
     x = problem.start({"a": 0.7, "b": -1.2})
-    error, signal = problem.compiled.prediction_error(x)
+    (missed,) = problem.compiled.misses(x).values()
     data = problem.data
-    np.testing.assert_allclose(error, ((data["y"] - 0.7 + 1.2 * data["x"]) ** 2).sum(1), rtol=1e-12)
-    np.testing.assert_allclose(signal, (data["y"] ** 2).sum(1), rtol=1e-12)
+    np.testing.assert_allclose(missed.count, data["y"].shape[1])
+    np.testing.assert_allclose(missed.error, ((data["y"] - 0.7 + 1.2 * data["x"]) ** 2).sum(1), rtol=1e-12)
+    np.testing.assert_allclose(missed.signal, (data["y"] ** 2).sum(1), rtol=1e-12)
 
 
 def test_a_reference_takes_the_place_of_the_prior():
