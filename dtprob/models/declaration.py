@@ -251,6 +251,11 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
             "none",
             "Pass the observed data, and give it to numpyro.sample as obs.",
         )
+    for name, measure in notes.measures.items():
+        if measure.site not in declaration.observed:
+            known = ", ".join(declaration.observed)
+            remedy = "Name the observed site of whose entries it tells"
+            raise InputError(f"measure {name}", f"an observed site among {known}", repr(measure.site), remedy)
     return declaration
 
 

@@ -7,11 +7,12 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
+from dtprob.errors import InputError
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.terms import error_db, in_user_terms
 from dtprob.gap.model.problem import Problem
-from dtprob.models.declaration import Measure, model
+from dtprob.models.declaration import Measure, declare, model
 from dtprob.models.multi_access import multi_access, records
 from dtprob.models.multi_access.model import MEASURES
 from tests.small_network import CLUSTERS, simulate
@@ -84,6 +85,12 @@ def test_a_tolerance_in_db_is_about_powers_and_what_has_a_signal():
 def test_outcomes_have_no_error_but_measures():
     problem, held, _ = held_out("outcomes", (RNG.random((RUNS, ROWS)) < 0.7).astype(int))
     assert set(in_user_terms(problem, held, held)) == {"twice_error"}
+
+
+def test_a_measure_of_no_observed_site_is_refused():
+    astray = model(measures={"lost_error": Measure("level", doubled)})(lambda y=None: levels(y))
+    with pytest.raises(InputError, match=r"measure lost_error.*'level'"):
+        declare(astray, {"y": jnp.asarray(DATA["normal"])})
 
 
 def test_a_network_tells_packets_per_slot():
