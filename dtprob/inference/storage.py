@@ -17,6 +17,7 @@ import xarray as xr
 from dtprob.errors import InputError
 from dtprob.files import atomic_write
 from dtprob.inference.posterior import Posterior
+from dtprob.models.declaration import unnamed_axes
 
 FORMAT = "dtprob posterior 1"
 _ENGINE = "h5netcdf"
@@ -142,7 +143,7 @@ def _dimensions(
     for name, array in arrays.items():
         rest = array.ndim - len(leading)
         given = tuple(axes.get(name, ()))
-        wanted[name] = given if len(given) == rest else tuple(f"{name}_dim_{i}" for i in range(rest))
+        wanted[name] = given if len(given) == rest else unnamed_axes(name, rest)
         for axis, size in zip(wanted[name], array.shape[len(leading) :], strict=True):
             largest[axis] = max(size, largest.get(axis, 0))
     chosen: dict[str, tuple[str, ...]] = {}

@@ -300,6 +300,11 @@ def _inner(fn: Any) -> Any:
     return fn
 
 
+def unnamed_axes(site: str, count: int) -> tuple[str, ...]:
+    """Names of the axes of a site, or of any array, that nothing names."""
+    return tuple(f"{site}{_UNNAMED}{i}" for i in range(count))
+
+
 def is_unnamed(axis: str) -> bool:
     """Whether an axis got its name from its site alone, since nothing in the model names it."""
     return _UNNAMED in axis
@@ -318,7 +323,7 @@ def _axes(
                 "Name every dimension, first to last.",
             )
         return declared
-    axes = [f"{name}{_UNNAMED}{i}" for i in range(len(shape))]
+    axes = list(unnamed_axes(name, len(shape)))
     for frame in frames:
         position = len(shape) - event_dim + frame.dim
         if 0 <= position < len(shape) and shape[position] == frame.size:

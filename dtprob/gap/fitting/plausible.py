@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import Final
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy import special
 
@@ -129,10 +129,15 @@ def places(effect: Effect) -> Bool[np.ndarray, " n"]:
     return _flat(effect, [p.is_place for p in effect.parameters])
 
 
+def sizes(effect: Effect) -> Int[np.ndarray, " size"]:
+    """Positions, among an effect's flat parameters, of those that are no places."""
+    return np.flatnonzero(~places(effect))
+
+
 def is_one_sided(effect: Effect) -> bool:
     """Whether an effect has a single size, which cannot be below its null, and else only places."""
-    sized = ~places(effect)
-    return bool(sized.sum() == 1 and sides(effect)[sized].all())
+    index = sizes(effect)
+    return len(index) == 1 and bool(sides(effect)[index[0]])
 
 
 def _flat(effect: Effect, values: Sequence[ArrayLike]) -> np.ndarray:

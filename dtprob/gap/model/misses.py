@@ -55,16 +55,16 @@ def _entries(
     observation: whiten.Observation, value: jax.Array
 ) -> tuple[jax.Array, jax.Array, jax.Array] | None:
     """Squared error, squared signal and one for each entry; None of outcomes and classes, which have no mean."""
-    parameters, one = observation.parameters, jnp.ones(jnp.shape(value))
+    parameters, one, nothing = observation.parameters, jnp.ones(value.shape), jnp.zeros(value.shape)
     if observation.family == "LogNormal":
         return (_DECIBELS * (jnp.log(value) - parameters["loc"])) ** 2, one, one
     if observation.family == "VonMises":
-        return jnp.angle(jnp.exp(1j * (value - parameters["loc"]))) ** 2, 0.0 * one, one
+        return jnp.angle(jnp.exp(1j * (value - parameters["loc"]))) ** 2, nothing, one
     if "loc" in parameters:
         return jnp.abs(value - parameters["loc"]) ** 2, jnp.abs(value) ** 2, one
     if LIKELIHOODS[observation.family].is_outcome:
         return None
-    return (value - whiten.distribution(observation).mean) ** 2, 0.0 * one, one
+    return (value - whiten.distribution(observation).mean) ** 2, nothing, one
 
 
 def _by_cluster(runner: Runner, name: str, entries: jax.Array) -> jax.Array:

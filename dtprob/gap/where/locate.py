@@ -23,7 +23,7 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.where.curves import Quantity, curves, quantity
-from dtprob.gap.where.families import Site, deterministic, families, observed, shifted
+from dtprob.gap.where.families import Along, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.suspects import Suspect, suspects
 
@@ -72,9 +72,10 @@ def locate(
 ) -> Location:
     """Test every site family and every block of coordinates at a fit."""
     blocks, maps = scan_coordinates(problem, drawn)
-    seen = _test_sites(problem, fitted, projection, drawn)
+    ways = _ways(problem, projection)
+    seen = _test_sites(problem, fitted, projection, drawn, ways)
     if _CLEAR[0] < seen.p_value < _CLEAR[1] and (further := more(drawn, settings.site_times)) is not None:
-        seen = _test_sites(problem, fitted, projection, further)
+        seen = _test_sites(problem, fitted, projection, further, ways)
     sure = {f.site for f in seen.findings if f.p_value <= _SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
@@ -95,14 +96,26 @@ class _Tested(NamedTuple):
         return min((f.p_value for f in self.findings), default=1.0)
 
 
-def _test_sites(problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates) -> _Tested:
+class _Ways(NamedTuple):
+    """How the values of sites may be wrong, whatever the replicates: along their axes, and over quantities."""
+
+    along: Along
+    over: Over
+
+
+def _ways(problem: Problem, projection: Projection) -> _Ways:
+    along = functools.cache(functools.partial(curves, problem))  # sites share their axes
+    return _Ways(along, [(q, tuple(q.curves())) for q in _quantities(problem, projection)])
+
+
+def _test_sites(
+    problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, ways: _Ways
+) -> _Tested:
     at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
     found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
     found += observed(problem, np.concatenate([drawn.observed[None], drawn.projected]))
-    along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    over = [(q, tuple(q.curves())) for q in _quantities(problem, found)]
-    tested = [(site, [family_test(*family) for family in families(along, over, site)]) for site in found]
+    tested = [(site, [family_test(*family) for family in families(*ways, site)]) for site in found]
     null = [test.null for _, tests in tested for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
     findings = [
@@ -112,7 +125,7 @@ def _test_sites(problem: Problem, fitted: Fit, projection: Projection, drawn: Re
     return _Tested(tested, findings)
 
 
-def _quantities(problem: Problem, sites: Sequence[Site]) -> Iterator[Quantity]:
+def _quantities(problem: Problem, projection: Projection) -> Iterator[Quantity]:
     """What the model computes and the data tell along several axes: a perturbation may vary over it."""
     arguments = {site.argument for site in problem.declaration.observed.values()}
     columns = {
@@ -124,7 +137,11 @@ def _quantities(problem: Problem, sites: Sequence[Site]) -> Iterator[Quantity]:
         and np.ndim(values) > 1
         and np.shape(values) == site.shape
     }
-    computed = {site.name: (site.axes, site.value) for site in sites if site.rows is None}
+    at = problem.compiled.sites(projection.origin)
+    computed = {
+        name: (problem.declaration.sites[name].axes, np.broadcast_to(np.asarray(at[name]), grown.shape))
+        for name, grown in problem.float_sites.items()
+    }
     for name, (axes, values) in (columns | computed).items():
         if (found := quantity(name, axes, values)) is not None:
             yield found

@@ -18,7 +18,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.bootstrap import Replicates
-from dtprob.gap.fitting.plausible import is_one_sided, log_bayes_factor, places, scales
+from dtprob.gap.fitting.plausible import is_one_sided, log_bayes_factor, scales, sizes
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.soundness import UNSEEN
 from dtprob.gap.model.problem import Problem
@@ -44,7 +44,7 @@ class Screening:
 
     Attributes:
         names: the candidates.
-        z: signed scores for one parameter, otherwise the normal quantile of the chi-square p-value.
+        z: signed scores for one size, otherwise the normal quantile of the chi-square p-value.
         p_value: of each candidate alone.
         adjusted: family-wise p-value over all candidates.
         log_bayes_factor: of adding the candidate, from (u, J) and its prior.
@@ -141,9 +141,9 @@ class Scores:
 
     def _evidence(self, effect: Effect, group: np.ndarray) -> float:
         """Places tell nothing beside the null."""
-        sized = ~places(effect)
-        own = group[sized]
-        information, scale = self.information[np.ix_(own, own)], scales(effect)[sized]
+        index = sizes(effect)
+        own = group[index]
+        information, scale = self.information[np.ix_(own, own)], scales(effect)[index]
         return log_bayes_factor(information, self.u[own], scale, one_sided=is_one_sided(effect))
 
     def pairs(self) -> tuple[Pair, ...]:
@@ -201,9 +201,9 @@ def _mean_tests(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         if not root.shape[1]:
             continue
         t = u[:, group] @ root
-        sized = np.flatnonzero(~places(effect))
-        if len(sized) == 1:
-            z[:, k] = t[:, 0] * np.sign(root[sized[0], 0])
+        index = sizes(effect)
+        if len(index) == 1:
+            z[:, k] = t[:, 0] * np.sign(root[index[0], 0])
             p[:, k] = stats.norm.sf(z[:, k]) if is_one_sided(effect) else 2 * stats.norm.sf(np.abs(z[:, k]))
         else:
             square, d = (t**2).sum(1), root.shape[1]

@@ -12,7 +12,7 @@ from jaxtyping import Float
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.bootstrap import Replicates, replicate
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.plausible import is_one_sided, places
+from dtprob.gap.fitting.plausible import is_one_sided, sizes
 from dtprob.gap.fitting.projection import Projection, project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -115,7 +115,7 @@ def _mean_gains(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         root = scores.root(k)
         t = u[:, group] @ root
         if is_one_sided(effect) and root.size:
-            t = np.maximum(t * np.sign(root[np.flatnonzero(~places(effect))[0], 0]), 0.0)
+            t = np.maximum(t * np.sign(root[sizes(effect)[0], 0]), 0.0)
         gain[:, k], size[k] = 0.5 * (t**2).sum(axis=1), root.shape[1]
     return gain, size
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy import stats
 
-from dtprob.gap.fitting.plausible import is_one_sided, places
+from dtprob.gap.fitting.plausible import is_one_sided, sizes
 from dtprob.gap.tails import log_gamma_tail
 from dtprob.gap.withheld.rivals.claim import Claim
 from dtprob.gap.withheld.rivals.look import Look, chance
@@ -38,6 +38,5 @@ def _log_p(seen: Look, k: int) -> np.ndarray:
     t = seen.u[:, group] @ vectors[:, keep] / np.sqrt(values[keep])
     effect = seen.scores.effects[k]
     if is_one_sided(effect):
-        size = np.flatnonzero(~places(effect))[0]
-        return stats.norm.logsf(t[:, 0] * np.sign(vectors[size, keep][0]))
+        return stats.norm.logsf(t[:, 0] * np.sign(vectors[sizes(effect)[0], keep][0]))
     return log_gamma_tail(0.5 * (t**2).sum(axis=1), keep.sum() / 2)
