@@ -181,16 +181,19 @@ class Compiled:
     def shifted_likelihood(self) -> Any:
         """(x, {site: perturbations (n, *site)}, n) -> log likelihood (n,) of the perturbed model."""
 
-        @quick_jit
-        def shifted_likelihood(x: Any, deltas: dict[str, jax.Array], arrays: Any) -> jax.Array:
-            def one(delta: dict[str, jax.Array]) -> jax.Array:
-                return self._likelihood(self._runner.run(x, arrays, delta))
+        @jax.jit
+        def shifted_likelihood(x: Any, deltas: dict[str, jax.Array], count: Any, arrays: Any) -> jax.Array:
+            def put(i: Any, into: jax.Array) -> jax.Array:
+                delta = {name: delta[i] for name, delta in deltas.items()}
+                return into.at[i].set(self._likelihood(self._runner.run(x, arrays, delta)))
 
-            return jax.lax.map(one, deltas)
+            return jax.lax.fori_loop(0, count, put, jnp.zeros(CHUNK))
 
         def chunked(x: np.ndarray, deltas: Mapping[str, Any], n: int) -> np.ndarray:
+            chunks = zip(range(n, 0, -CHUNK), self._padded(deltas, n), strict=True)
             parts = [
-                shifted_likelihood(jnp.asarray(x), chunk, self.arrays) for chunk in self._padded(deltas, n)
+                shifted_likelihood(jnp.asarray(x), chunk, min(left, CHUNK), self.arrays)
+                for left, chunk in chunks
             ]
             return np.concatenate([np.asarray(part) for part in parts])[:n]
 
