@@ -11,7 +11,7 @@ from dtprob.gap.fitting.bootstrap import replicate
 from dtprob.gap.fitting.projection import Projection, project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.locate import Location, locate
+from dtprob.gap.where.locate import NOWHERE, Location, locate
 from dtprob.gap.which.screen import Screening, screen
 
 
@@ -39,10 +39,12 @@ class View:
         return float(self.screening.adjusted.min(initial=1.0)) <= level or self.location.site_p_value <= level
 
 
-def view(problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settings) -> View:
-    """Screen all candidates and map the gap at a fit, on one bootstrap."""
+def view(
+    problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settings, *, located: bool = True
+) -> View:
+    """Screen all candidates and map the gap at a fit, on one bootstrap; without maps if not `located`."""
     projection = project(problem, fitted)
     drawn = replicate(problem, fitted, projection, key, settings)
     screening = screen(problem, fitted, projection, drawn, settings)
-    location = locate(problem, fitted, projection, drawn, settings)
+    location = locate(problem, fitted, projection, drawn, settings) if located else NOWHERE
     return View(problem, fitted, projection, screening, location)

@@ -88,11 +88,14 @@ def polish(
         freed: modes that no other peak is better than; where one of them is reached the search is over.
     """
     scale = problem.prior_draws(jax.random.key(0), _PRIOR_DRAWS).std(axis=0)
+    means = [
+        e.name for e in problem.live if e.name in fitted.effects and e.kind == "mean"
+    ]  # fields stay meanwhile
     for _ in range(_ROUNDS):
         if any(_is_same(fitted, one) for one in freed):
             return fitted
         peaks = _other_peaks(problem, fitted.x, scale, along)
-        short = [fitting.fit(problem, x, fitted.effects, spread=fitted.spread, steps=_SHORT) for x in peaks]
+        short = [fitting.fit(problem, x, means, steps=_SHORT) for x in peaks]
         short.sort(key=lambda f: -f.log_posterior)
         long = [fitting.fit(problem, f.x, fitted.effects, spread=fitted.spread) for f in short[:_LONG]]
         best = max(long, key=lambda f: f.log_posterior, default=fitted)

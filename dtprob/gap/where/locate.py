@@ -67,6 +67,10 @@ class Location:
     entries: Mapping[str, np.ndarray] = MappingProxyType({})
 
 
+NOWHERE: Final = Location((), (), {}, 1.0)
+"""No map: nothing was looked at."""
+
+
 def locate(
     problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, settings: Settings
 ) -> Location:

@@ -171,10 +171,18 @@ def _forward(
         problem, fitted = reached.problem, reached.fitted
 
 
-def _looked(problem: Problem, fitted: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> View:
+def _looked(
+    problem: Problem,
+    fitted: fitting.Fit,
+    key: jax.Array,
+    settings: Settings,
+    say: Say,
+    *,
+    located: bool = True,
+) -> View:
     beside = f" beside {', '.join(fitted.effects)}" if fitted.effects else ""
     say(f"screening {len(problem.effects)} effects{beside}")
-    return view(problem, fitted, key, settings)
+    return view(problem, fitted, key, settings, located=located)
 
 
 def _revised(
@@ -193,7 +201,8 @@ def _revised(
             return
         rest = _refitted_without(reached.problem, reached.fitted, left_out)
         looked.add(frozenset(rest.effects))
-        seen = _looked(reached.problem, rest, jax.random.fold_in(key, i), settings, say)
+        again = jax.random.fold_in(key, i)
+        seen = _looked(reached.problem, rest, again, settings, say, located=False)  # chosen by scores alone
         trials = tried(seen, settings, say, {left_out: reached}, banned=banned)
         last = Step(seen, trials, best(seen, base, trials.fits, settings))
         yield last
