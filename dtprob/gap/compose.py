@@ -15,6 +15,7 @@ from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.terms import in_user_terms
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.locate import SiteFinding
+from dtprob.gap.where.reach import touched
 from dtprob.gap.which.screen import Screening
 from dtprob.inference.engine import AbstractEngine
 
@@ -103,7 +104,8 @@ def _place(found: SiteFinding) -> str:
 
 def _where(evidence: Evidence) -> dict[str, Any]:
     total = max(evidence.floor.best - float(evidence.held_before.log_likelihood.sum()), 1e-12)
-    excess = sum(c.excess for c in evidence.before.coordinates) or 1.0
+    coordinates = touched(evidence.steps[0].view, evidence.last)
+    excess = sum(c.excess for c in coordinates) or 1.0
     accepted = {e.name: e for e in evidence.problem.effects if e.name in evidence.accepted}
     own = {site for e in accepted.values() for site in e.sites}
     closed_share = evidence.fraction.mean if evidence.fraction is not None else 0.0
@@ -121,7 +123,7 @@ def _where(evidence: Evidence) -> dict[str, Any]:
                 "p_value": c.p_value,
                 "share": max(c.excess, 0.0) / max(excess, c.excess),
             }
-            for c in evidence.before.coordinates
+            for c in coordinates
         ],
     }
 
