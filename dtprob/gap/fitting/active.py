@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final
@@ -68,6 +68,11 @@ def activate(
     return Active(
         tuple(blocks), chosen, weights, {e.name: spread.get(e.name, _first_spread(e)) for e in fields}
     )
+
+
+def means_among(problem: Problem, names: Collection[str]) -> list[str]:
+    """Those of the named live effects that are no random fields."""
+    return [e.name for e in problem.live if e.name in names and e.kind == "mean"]
 
 
 def _first_spread(effect: Effect) -> float:

@@ -9,6 +9,7 @@ import numpy as np
 
 from dtprob.effects.effect import effects_of
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.active import means_among
 from dtprob.gap.fitting.marginal import settled
 from dtprob.gap.fitting.soundness import broken
 from dtprob.gap.fitting.sweep import turned
@@ -88,9 +89,7 @@ def polish(
         freed: modes that no other peak is better than; where one of them is reached the search is over.
     """
     scale = problem.prior_draws(jax.random.key(0), _PRIOR_DRAWS).std(axis=0)
-    means = [
-        e.name for e in problem.live if e.name in fitted.effects and e.kind == "mean"
-    ]  # fields stay meanwhile
+    means = means_among(problem, fitted.effects)  # in short fits random fields stay as they are
     for _ in range(_ROUNDS):
         if any(_is_same(fitted, one) for one in freed):
             return fitted

@@ -61,11 +61,16 @@ def replicate(
         settings: how many replicates there are, and how many of them are taken to the sites.
     """
     keys = jax.random.split(key, settings.replicates)
-    raw = projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)))
-    observed = projection.rows(raw[None])[0]
+    raw, observed = observed_rows(problem, fitted, projection)
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
     gradients = problem.compiled.site_gradient(fitted.x, np.concatenate([observed[None], projected]))
     return Replicates(problem, fitted, projection, keys, raw, observed, projected, gradients)
+
+
+def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the data (cluster, row) as if nothing had been fitted, and projected."""
+    raw = projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)))
+    return raw, projection.rows(raw[None])[0]
 
 
 def more(drawn: Replicates, times: int) -> Replicates | None:

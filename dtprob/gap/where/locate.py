@@ -76,7 +76,7 @@ def locate(
 ) -> Location:
     """Test every site family and every block of coordinates at a fit."""
     blocks, maps = scan_coordinates(problem, drawn)
-    ways = _ways(problem, projection)
+    ways = _ways(problem, projection.origin)  # what was fitted to these data would agree with them
     seen = _test_sites(problem, fitted, projection, drawn, ways)
     if _CLEAR[0] < seen.p_value < _CLEAR[1] and (further := more(drawn, settings.site_times)) is not None:
         seen = _test_sites(problem, fitted, projection, further, ways)
@@ -101,25 +101,29 @@ class _Tested(NamedTuple):
 
 
 class _Ways(NamedTuple):
-    """How the values of sites may be wrong, whatever the replicates: along their axes, and over quantities."""
+    """The values of sites, and how they may be wrong, whatever the replicates: along their axes, and over quantities."""
 
+    values: Mapping[str, np.ndarray]
     along: Along
     over: Over
 
 
-def _ways(problem: Problem, projection: Projection) -> _Ways:
+def _ways(problem: Problem, x: np.ndarray) -> _Ways:
+    at = problem.compiled.sites(x)
+    values = {n: np.broadcast_to(np.asarray(at[n]), grown.shape) for n, grown in problem.float_sites.items()}
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    return _Ways(along, [(q, tuple(q.curves())) for q in _quantities(problem, projection)])
+    return _Ways(values, along, [(q, tuple(q.curves())) for q in _quantities(problem, values)])
 
 
 def _test_sites(
     problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, ways: _Ways
 ) -> _Tested:
-    at = problem.compiled.sites(projection.origin)  # what was fitted to these data would agree with them
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
-    found = [deterministic(n, axes[n], np.asarray(at[n]), np.asarray(g)) for n, g in drawn.gradients.items()]
+    found = [deterministic(n, axes[n], ways.values[n], np.asarray(g)) for n, g in drawn.gradients.items()]
     found += observed(problem, np.concatenate([drawn.observed[None], drawn.projected]))
-    tested = [(site, [family_test(*family) for family in families(*ways, site)]) for site in found]
+    tested = [
+        (site, [family_test(*family) for family in families(ways.along, ways.over, site)]) for site in found
+    ]
     null = [test.null for _, tests in tested for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
     findings = [
@@ -129,25 +133,21 @@ def _test_sites(
     return _Tested(tested, findings)
 
 
-def _quantities(problem: Problem, projection: Projection) -> Iterator[Quantity]:
+def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
     """What the model computes and the data tell along several axes: a perturbation may vary over it."""
     arguments = {site.argument for site in problem.declaration.observed.values()}
     columns = {
-        name: (site.axes, np.asarray(values))
-        for name, values in problem.data.items()
+        name: (site.axes, np.asarray(column))
+        for name, column in problem.data.items()
         for site in problem.declaration.observed.values()
         if name not in arguments
-        and eqx.is_array_like(values)
-        and np.ndim(values) > 1
-        and np.shape(values) == site.shape
+        and eqx.is_array_like(column)
+        and np.ndim(column) > 1
+        and np.shape(column) == site.shape
     }
-    at = problem.compiled.sites(projection.origin)
-    computed = {
-        name: (problem.declaration.sites[name].axes, np.broadcast_to(np.asarray(at[name]), grown.shape))
-        for name, grown in problem.float_sites.items()
-    }
-    for name, (axes, values) in (columns | computed).items():
-        if (found := quantity(name, axes, values)) is not None:
+    computed = {name: (problem.declaration.sites[name].axes, value) for name, value in values.items()}
+    for name, (axes, value) in (columns | computed).items():
+        if (found := quantity(name, axes, value)) is not None:
             yield found
 
 

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float, Int
 from scipy import stats
 
+from dtprob.gap.fitting.active import means_among
+from dtprob.gap.fitting.bootstrap import observed_rows
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.refit import at_null_except
@@ -76,8 +78,7 @@ def reach(
         fitted: its fit with some of them; random fields among these are left out.
     """
     delta, rows = _shift(problem, base, wider, fitted), problem.rows
-    residual = projection.before_fit(np.asarray(problem.compiled.residual(base.x)))
-    projected = projection.rows(residual[None])[0]
+    _, projected = observed_rows(problem, base, projection)
     delta = np.where(rows.by_cluster(rows.located) == 1, delta, 0.0)
     if not np.isfinite(delta).all() or not (delta**2).any():
         return ()
@@ -117,7 +118,7 @@ def _held(energy: Float[np.ndarray, " position"], *, together: bool) -> Iterator
 
 def _shift(problem: Problem, base: Fit, wider: Problem, fitted: Fit) -> np.ndarray:
     """Whitened shift (cluster, row) of the observed distributions from the base fit to the one with the mean effects."""
-    kept = [e.name for e in wider.live if e.name in fitted.effects and e.kind == "mean"]
+    kept = means_among(wider, fitted.effects)
     there = wider.compiled.observations(at_null_except(wider, fitted, kept)) if kept else {}
     shifts = {}
     for name, observed in problem.compiled.observations(base.x).items():

@@ -1,4 +1,4 @@
-"""Where accepted causes act: blocks against sums by hand, and no block where a cause does nothing."""
+"""Where accepted causes close the gap: the blocks that they reach, and none where they do nothing."""
 
 import numpy as np
 import numpyro.distributions as dist
