@@ -179,7 +179,7 @@ def _coupled(clusters: ClustersLike, i: int, j: int, *, same: bool) -> Effect:
 
 
 def drift(sites: Sites, data: Data) -> list[Effect]:
-    """The load of a device, or how well the channel delivers, changes over the log."""
+    """The load of a device, or how well the channel delivers, changes from the beginning of the log on."""
     clusters = _clusters(sites, data)
     if clusters is None or sites["arrival_logits"].shape[0] < 2:
         return []
@@ -203,10 +203,10 @@ def _drift(rewrites: Mapping[str, Any], instance: str, what: str) -> Effect:
     return Effect(
         "drift",
         rewrites,
-        (normal("log_odds", 0.5),),
+        (normal("log_odds", 1.0),),
         instance=instance,
-        physics=f"The log-odds of {what} change linearly, by twice this over the whole log.",
-        source="P exp(c x), x from -1 in the first window to 1 in the last.",
+        physics=f"The log-odds of {what} change linearly from what the twin learned before, by this over the whole log.",
+        source="P exp(c x), x from 0 in the first window to 1 in the last.",
     )
 
 

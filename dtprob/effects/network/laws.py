@@ -163,8 +163,8 @@ def _has(joint: Any, clusters: ClustersLike, device: int) -> Float[Array, "episo
 
 
 def progress(windows: int) -> Float[np.ndarray, "window 1"]:
-    """Place of each window in the log, -1 at its start and 1 at its end."""
-    return np.linspace(-1.0, 1.0, windows)[:, None]
+    """Place of each window in the log, 0 at its start and 1 at its end."""
+    return np.linspace(0.0, 1.0, windows)[:, None]
 
 
 def from_then_on(amount: Any, windows: int, onset: Any) -> Float[Array, " window"]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Final
@@ -11,7 +11,7 @@ import numpy as np
 
 from dtprob.gap.settings import Settings
 from dtprob.gap.withheld.limits import Limit, correlation_matrix, is_resolvable, limit
-from dtprob.gap.withheld.truths import PARAMETERS, SITES
+from dtprob.gap.withheld.truths import INSTANCES_UNTOLD, PARAMETERS, SITES
 
 type Report = Mapping[str, Any]
 type Truth = Mapping[str, Any]
@@ -63,13 +63,18 @@ class Answer:
 
     @property
     def named(self) -> frozenset[str]:
-        """The effects of the most probable cause."""
-        return frozenset(self.first["effects"]) if self.first else frozenset()
+        """The effects of the most probable cause, each in the words of the key."""
+        return self._told(self.first["effects"]) if self.first else frozenset()
 
     @property
     def alias_class(self) -> list[frozenset[str]]:
         """All sets of effects that the answer holds possible."""
-        return [frozenset(item) for item in self.first["alias_class"]] if self.first else []
+        return [self._told(item) for item in self.first["alias_class"]] if self.first else []
+
+    def _told(self, names: Iterable[str]) -> frozenset[str]:
+        """Names with the family in place of an instance that the key does not tell."""
+        untold = self.effects & INSTANCES_UNTOLD.get(self.track, frozenset())
+        return frozenset(_family(name) if _family(name) in untold else name for name in names)
 
     @property
     def is_alarm(self) -> bool:
@@ -239,4 +244,8 @@ class Answer:
 
 
 def _families(names: frozenset[str]) -> frozenset[str]:
-    return frozenset(name.split("[")[0] for name in names)
+    return frozenset(map(_family, names))
+
+
+def _family(name: str) -> str:
+    return name.split("[", maxsplit=1)[0]

@@ -136,3 +136,8 @@ PARAMETERS: Final[Mapping[str, Mapping[str, Sizes]]] = {
 A sign that the key does not tell may be either. Families whose shape is another in truth, as zones with soft edges are,
 have no size to compare: what the library's parameter should be is then not what the key holds.
 """
+
+INSTANCES_UNTOLD: Final[Mapping[str, frozenset[str]]] = {
+    "channel": frozenset({"antenna_pattern", "blockage", "extra_path", "frequency_ripple", "interference"}),
+}
+"""Families of which the key tells no instance, while the library has nothing else: the family is what counts."""

@@ -131,6 +131,13 @@ def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, da
     np.testing.assert_allclose(grown[:, 1], np.broadcast_to(before[0, 0, 1], grown[:, 1].shape), rtol=1e-6)
 
 
+def test_a_drift_begins_where_the_twin_has_learned(offered, data):
+    before, after = law(data, None), law(data, offered["drift[device_0]"], log_odds=jnp.array(0.7))
+    factor = (after[..., 2:] / after[..., :2]) / (before[..., 2:] / before[..., :2])
+    np.testing.assert_allclose(factor[0, 0, 0], 1.0, rtol=1e-6)
+    np.testing.assert_allclose(factor[-1, 0, 0], np.exp(0.7), rtol=1e-6)
+
+
 def test_a_busier_device_adds_packets_and_leaves_its_neighbour_alone(offered, data):
     after = law(data, offered["arrival_rate_shift[device_0]"], extra=jnp.log(2.0))
     np.testing.assert_allclose(after[0, 0, 0], [0.1, 0.2, 0.4, 0.3], atol=1e-9)

@@ -62,6 +62,29 @@ def rate(scored, kind, name):
     return stratum["rates"][name]["count"], stratum["rates"][name]["of"]
 
 
+@pytest.mark.parametrize(
+    ("named", "track", "right"),
+    [
+        ("frequency_ripple[6_cycles]", "channel", True),
+        (
+            "frequency_ripple[6_cycles]",
+            "network",
+            False,
+        ),  # no such family in that track: the key would have told
+        ("doppler[floor]", "channel", False),  # the library has `doppler`, too
+        ("blockage[arrival_0]", "channel", False),
+    ],
+)
+def test_a_family_counts_where_the_key_tells_no_instance_and_the_library_has_nothing_else(
+    named, track, right
+):
+    true = "doppler" if named.startswith("doppler") else "frequency_ripple"
+    answer = Answer(track, case("0000", "listed", true), report("LISTED", named), None)
+    assert answer.is_right is right
+    assert answer.is_in_class is right
+    assert answer.wrong_names() == [not right]
+
+
 def test_counts_per_stratum(scored):
     assert rate(scored, "null", "alarm") == (1, 2)
     assert rate(scored, "listed", "right effect first") == (1, 3)
