@@ -42,6 +42,8 @@ class Parameter:
         unit: SI unit as text, "1" for a pure number.
         is_place: whether it says where an effect acts, such as the edge of a region, and not how much: it does nothing as
             long as the effect's sizes are at their null, and its prior holds as it stands, however small the effect.
+        tried: values of a place at which an effect of one size is looked for before it is fitted; its prior, a normal one,
+            is then centred at the best of them.
     """
 
     name: str
@@ -49,6 +51,7 @@ class Parameter:
     null: float = 0.0
     unit: str = "1"
     is_place: bool = False
+    tried: tuple[float, ...] = ()
 
     @property
     def shape(self) -> tuple[int, ...]:

@@ -20,6 +20,7 @@ from dtprob.effects.common import (
     touched_objects,
 )
 from dtprob.effects.effect import Effect
+from dtprob.effects.pole import poles
 from dtprob.raytracing.paths import NONE, REFRACTION, SPECULAR, PathSet
 
 type Choice = Callable[[PathSet], jax.Array]
@@ -47,10 +48,10 @@ def missing_path(sites: Sites, data: Data) -> list[Effect]:
 
 
 def blockage(sites: Sites, data: Data) -> list[Effect]:
-    """An obstacle attenuates the line of sight, or all paths through a sector of azimuth."""
+    """An obstacle attenuates the line of sight, a sector of azimuth, or what passes a narrow pole."""
     if not offers(sites, "path_gain") or data.get("paths") is None:
         return []
-    return [
+    sectors = [
         Effect(
             "blockage",
             {"path_gain": _attenuated(choose)},
@@ -62,6 +63,7 @@ def blockage(sites: Sites, data: Data) -> list[Effect]:
         )
         for name, text, choose in _distinct(data["paths"], [_LINE_OF_SIGHT, *_sectors()])
     ]
+    return [*sectors, *poles(sites, data)]
 
 
 def _scaled(choose: Choice) -> Any:

@@ -126,7 +126,7 @@ def _causes(
     if not evidence.accepted:
         return ()
     say(f"confirming {', '.join(evidence.accepted)} with {type(engine).__name__}")
-    effects = [e for e in evidence.problem.effects if e.name in evidence.accepted]
+    effects = [e for e in evidence.last.problem.effects if e.name in evidence.accepted]
     sizes, plausible = confirm(evidence.last.problem, evidence.fitted, effects, key, engine)
     classes, probability = alternatives(evidence, settings)
     first = evidence.held_after.estimates

@@ -15,15 +15,19 @@ _BELOW: Final = 4
 
 
 def family_wise(p: np.ndarray, replicate_p: np.ndarray) -> np.ndarray:
-    """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show.
+    """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show."""
+    return -np.expm1(effective_tests(replicate_p) * np.log1p(-np.minimum(p, 1 - 1e-16)))
+
+
+def effective_tests(replicate_p: np.ndarray) -> float:
+    """Number of independent tests whose smallest p-value is distributed as that of the replicates.
 
     Far out there may be more of them than near the middle, so the level is looked at too where there are the replicates.
     """
     told = _LEVELS[(_LEVELS * len(replicate_p) >= _BELOW) | (_LEVELS.max() == _LEVELS)]
     quantiles = np.quantile(np.maximum(replicate_p, 1e-300), told)
     effective = np.log1p(-told) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
-    m = float(np.clip(np.max(effective), 1.0, 1e6))
-    return -np.expm1(m * np.log1p(-np.minimum(p, 1 - 1e-16)))
+    return float(np.clip(np.max(effective), 1.0, 1e6))
 
 
 def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ from dtprob.gap.fitting.projection import Projection, project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.locate import NOWHERE, Location, locate
+from dtprob.gap.which.places import place
 from dtprob.gap.which.screen import Screening, screen
 
 
@@ -45,6 +46,7 @@ def view(
     """Screen all candidates and map the gap at a fit, on one bootstrap; without maps if not `located`."""
     projection = project(problem, fitted)
     drawn = replicate(problem, fitted, projection, key, settings)
-    screening = screen(problem, fitted, projection, drawn, settings)
+    problem, placed = place(problem, fitted, drawn)
+    screening = screen(problem, fitted, projection, drawn, settings, placed=placed)
     location = locate(problem, fitted, projection, drawn, settings) if located else NOWHERE
     return View(problem, fitted, projection, screening, location)

@@ -285,6 +285,11 @@ def _extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
         if offered[name].kind == "variance":
             expected = "effects with parameters of their own"
             raise InputError(where, expected, f"the random field {name}", "Leave it among the candidates")
+        if any(p.tried for p in offered[name].parameters):
+            expected = "effects at a place of their own"
+            raise InputError(
+                where, expected, f"{name}, which may be anywhere", "Leave it among the candidates"
+            )
         added.append(offered[name])
     return with_effects(model, added)
 

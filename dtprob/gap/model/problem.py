@@ -119,6 +119,15 @@ class Problem:
         other.set_live(other.effects)
         return other
 
+    def with_candidates(self, effects: Sequence[Effect]) -> Problem:
+        """The same problem with candidates of the same names but other nulls; live ones among these are live no more."""
+        _ = self.programs, self.float_sites, self.field_shapes, self._draw  # made once, then shared
+        other, kept = copy(self), {id(e) for e in effects}
+        other.effects = tuple(effects)
+        if any(id(e) not in kept for e in self.live):
+            other.set_live(tuple(e for e in self.live if id(e) in kept))
+        return other
+
     def with_volume(self, volume: Volume | None) -> Problem:
         """The same problem, in which the clusters' own unknowns are integrated out as the volume says."""
         other = copy(self)

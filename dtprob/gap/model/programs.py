@@ -9,6 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from dtprob.effects.effect import FIELD, Context, Effect
 from dtprob.gap.model.quick import Hoisted
@@ -16,6 +17,8 @@ from dtprob.models.declaration import Data, split_static
 
 TRIALS: Final = 16
 """Sizes of each effect that are tried in one run."""
+_PLACES: Final = 128
+"""Places of an effect whose tangents are held at once."""
 
 
 class Programs:
@@ -29,9 +32,14 @@ class Programs:
         means = [e for e in effects if e.kind == "mean" and e.rewrites]
         fields = [e for e in effects if e.kind == "variance"]
 
-        def tangents(values: Mapping[str, jax.Array], arrays: Any) -> dict[str, dict[str, jax.Array]]:
+        def tangents(
+            values: Mapping[str, jax.Array], nulls: Mapping[str, jax.Array], arrays: Any
+        ) -> dict[str, dict[str, jax.Array]]:
             context = Context(eqx.combine(arrays, static), values)
-            return {e.name: {s: _derivative(e, s, values[s], context) for s in e.rewrites} for e in means}
+            return {
+                e.name: {s: _derivative(e, s, values[s], nulls[e.name], context) for s in e.rewrites}
+                for e in means
+            }
 
         def energy(
             values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], arrays: Any
@@ -46,11 +54,44 @@ class Programs:
             return {e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in means}
 
         self._tangents, self._energy, self._trials = Hoisted(tangents), Hoisted(energy), Hoisted(trials)
+        self._means, self._static = {e.name: e for e in means}, static
+        self._place_scores: dict[str, Hoisted] = {}
         self._nulls = {e.name: np.asarray(null_vector(e)) for e in means}
 
-    def site_tangents(self, values: Mapping[str, jax.Array]) -> dict[str, dict[str, jax.Array]]:
-        """For each mean effect and rewritten site the derivative (*site, parameter) at the null."""
-        return self._tangents(dict(values), self._arrays)
+    def site_tangents(
+        self, values: Mapping[str, jax.Array], effects: Sequence[Effect]
+    ) -> dict[str, dict[str, jax.Array]]:
+        """For each mean effect and rewritten site the derivative (*site, parameter) at the null.
+
+        Args:
+            values: of the sites.
+            effects: the candidates; those that have been given another null than at first are taken there.
+        """
+        own = {e.name: null_vector(e) for e in effects if e.name in self._nulls}
+        return self._tangents(dict(values), {**self._nulls, **own}, self._arrays)
+
+    def place_scores(
+        self,
+        name: str,
+        values: Mapping[str, jax.Array],
+        gradients: Mapping[str, jax.Array],
+        points: Float[np.ndarray, "place parameter"],
+    ) -> Float[np.ndarray, "place n"]:
+        """Scores of an effect of one size at each of its places.
+
+        Args:
+            name: of the effect.
+            values: of the sites, at the fit.
+            gradients: of the data and then of replicates under the fit, (n, *site) for each site.
+            points: its flat parameters, the size at its null.
+        """
+
+        def scores(values: Any, gradients: Any, points: jax.Array, arrays: Any) -> jax.Array:
+            context = Context(eqx.combine(arrays, self._static), values)
+            return _place_scores(self._means[name], values, gradients, points, context)
+
+        run = self._place_scores.setdefault(name, Hoisted(scores, jax.jit))
+        return np.asarray(run(dict(values), dict(gradients), points, self._arrays))
 
     def trial_shifts(
         self, values: Mapping[str, jax.Array], sizes: Mapping[str, np.ndarray]
@@ -106,14 +147,41 @@ def null_vector(effect: Effect) -> jax.Array:
     return jnp.concatenate([jnp.full(p.shape, p.null).reshape(-1) for p in effect.parameters])
 
 
-def _derivative(effect: Effect, site: str, value: jax.Array, context: Context) -> jax.Array:
+def _derivative(effect: Effect, site: str, value: jax.Array, null: jax.Array, context: Context) -> jax.Array:
     def moved(flat: jax.Array) -> jax.Array:
         return jnp.asarray(effect.rewrites[site](value, unflatten(effect, flat), context)).astype(value.dtype)
 
-    null = null_vector(effect)
     if len(null) > 1:
         return jax.jacfwd(moved)(null)
     return jax.jvp(moved, (null,), (jnp.ones(1),))[1][..., None]  # half the tracing
+
+
+def _place_scores(
+    effect: Effect,
+    values: Mapping[str, jax.Array],
+    gradients: Mapping[str, jax.Array],
+    points: jax.Array,
+    context: Context,
+) -> jax.Array:
+    sites = [site for site in effect.rewrites if site in gradients]
+    flat = jnp.concatenate([gradients[site].reshape(len(gradients[site]), -1) for site in sites], axis=1)
+    size = jnp.concatenate(
+        [jnp.full(p.shape, 0.0 if p.is_place else 1.0).reshape(-1) for p in effect.parameters]
+    )
+
+    def moved(at: jax.Array) -> jax.Array:
+        parameters, parts = unflatten(effect, at), []
+        for site in sites:
+            new = jnp.asarray(effect.rewrites[site](values[site], parameters, context))
+            parts.append(
+                jnp.broadcast_to(new.astype(values[site].dtype), gradients[site].shape[1:]).reshape(-1)
+            )
+        return jnp.concatenate(parts)
+
+    def one(point: jax.Array) -> jax.Array:
+        return jnp.real(flat @ jax.jvp(moved, (point,), (size,))[1])
+
+    return jax.lax.map(one, points, batch_size=_PLACES)
 
 
 def _trial_shifts(

@@ -19,17 +19,20 @@ quick_jit = partial(
 
 @final
 class Hoisted:
-    """A function compiled by `quick_jit`, the arrays that it closes over among the program's arguments.
+    """A compiled function, the arrays that it closes over among the program's arguments.
 
     Otherwise they would be constants of the program, which then serves no other data of the same shapes, and which takes
     longer to compile the larger they are.
 
     Args:
         function: of arrays, to arrays.
+        compiler: `jax.jit` where the function runs for longer than it is compiled.
     """
 
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
+    def __init__(
+        self, function: Callable[..., Any], compiler: Callable[..., Callable[..., Any]] = quick_jit
+    ) -> None:
+        self._function, self._compiler = function, compiler
         self._programs: dict[Any, tuple[Any, Callable[..., Any]]] = {}
 
     def __call__(self, *arguments: Any) -> Any:
@@ -45,4 +48,4 @@ class Hoisted:
         """The arrays that the function closes over, and the program that takes them before its arguments."""
         converted = eqx.filter_closure_convert(self._function, *arguments)
         closed, rest = eqx.partition(converted, lambda leaf: isinstance(leaf, jax.Array | np.ndarray))
-        return closed, quick_jit(lambda closed, *given: eqx.combine(closed, rest)(*given))
+        return closed, self._compiler(lambda closed, *given: eqx.combine(closed, rest)(*given))

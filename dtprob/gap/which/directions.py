@@ -109,7 +109,7 @@ def tangents(around: Surroundings, effects: Sequence[Effect], programs: Programs
     sizes = [e.dimension for e in effects]
     groups = tuple(np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])) if effects else ()
     columns = np.zeros((*problem.rows.gather.shape, sum(sizes)))
-    found = programs.site_tangents(around.grown())
+    found = programs.site_tangents(around.grown(), problem.effects)
     places = [(effect.name, j) for effect in effects for j in range(effect.dimension)]
     for low in range(0, len(places), CHUNK):
         part = places[low : low + CHUNK]

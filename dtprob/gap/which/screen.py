@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import jax
 import numpy as np
@@ -32,6 +33,7 @@ from dtprob.gap.tails import (
 from dtprob.gap.which.directions import Tangents, surroundings, tangents
 from dtprob.gap.which.fields import field_tests
 from dtprob.gap.which.pairs import Pair, best_pairs
+from dtprob.gap.which.places import Placed
 
 _ABSORBED = 0.98
 _SEEN = 25.0
@@ -70,9 +72,24 @@ class Screening:
 
 
 def screen(
-    problem: Problem, fitted: fitting.Fit, projection: Projection, drawn: Replicates, settings: Settings
+    problem: Problem,
+    fitted: fitting.Fit,
+    projection: Projection,
+    drawn: Replicates,
+    settings: Settings,
+    *,
+    placed: Mapping[str, Placed] = MappingProxyType({}),
 ) -> Screening:
-    """Score every candidate that the fit does not already contain."""
+    """Score every candidate that the fit does not already contain.
+
+    Args:
+        problem: the model and candidates on their data.
+        fitted: the fit.
+        projection: of rows there.
+        drawn: the data and replicates there.
+        settings: the level that is to be noticed.
+        placed: how the places of effects that may act anywhere were found, by name.
+    """
     candidates = [e for e in problem.effects if e.name not in fitted.effects]
     means = [e for e in candidates if e.kind == "mean"]
     fields = [e for e in candidates if e.kind == "variance"]
@@ -80,14 +97,24 @@ def screen(
     scores = mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
     energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
     tested = field_tests(energy, [e.name for e in fields], len(drawn.projected))
-    mean_p, mean_z = _mean_tests(scores, scores.u[None])
-    null_p = _mean_tests(scores, scores.u_null)[0].min(axis=1, initial=1.0)
-    # The fields' replicates are the first of the same data sets.
-    replicate_p = np.minimum(null_p[: len(tested.replicates)], tested.replicates) if fields else null_p
+    (mean_p, mean_z), null_p = _mean_tests(scores, scores.u[None]), _mean_tests(scores, scores.u_null)[0]
+    price = np.array([placed[e.name].price if e.name in placed else 0.0 for e in means])
+    for k, found in ((k, placed[e.name]) for k, e in enumerate(means) if e.name in placed):
+        mean_p[0, k], null_p[:, k] = found.p_value, 1.0
+        mean_z[0, k] = np.copysign(
+            stats.norm.isf(found.p_value / (1 if is_one_sided(means[k]) else 2)), mean_z[0, k]
+        )
+    replicate_p = null_p.min(axis=1, initial=1.0)
+    # The replicates of fields and of places are the first of the same data sets.
+    for others in (
+        *([tested.replicates] if fields else []),
+        *(found.replicate_p for found in placed.values()),
+    ):
+        replicate_p = np.minimum(replicate_p[: len(others)], others)
     smallest = np.concatenate([mean_p[0], tested.smallest])
     names = [e.name for e in (*means, *fields)]
     order = np.array([names.index(c.name) for c in candidates], int)
-    log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
+    log_bf = np.concatenate([scores.log_bayes_factor - price, tested.log_bayes_factor])
     return Screening(
         names=tuple(c.name for c in candidates),
         z=np.concatenate([mean_z[0], tested.z])[order],

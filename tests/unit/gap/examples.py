@@ -10,6 +10,8 @@ from dtprob.models.complex_normal import ComplexNormal
 
 SIGMA = 0.5
 N_LINK, N_SAMPLE = 12, 8
+PLACES = tuple(np.linspace(-2.0, 2.0, 21).tolist())
+WIDTH = 0.15
 
 
 def line(x, y=None):
@@ -185,3 +187,19 @@ def jitter():
         kind="variance",
         field_shape=lambda value, context: (value.shape[0], *(1,) * (value.ndim - 1)),
     )
+
+
+def bump(prior=None):
+    """Raises the mean by c around some x, which the data tell."""
+    prior = dist.Normal(0.0, 2.0) if prior is None else prior
+
+    def rewrite(value, p, context):
+        return value + p["c"] * jnp.exp(-0.5 * ((context["x"] - p["at"]) / WIDTH) ** 2)
+
+    at = Parameter("at", dist.Normal(0.0, 1.2), is_place=True, tried=PLACES)
+    return Effect("bump", {"mean": rewrite}, (Parameter("c", prior), at))
+
+
+def raised(x, at, size):
+    """What a bump adds."""
+    return size * np.exp(-0.5 * ((x - at) / WIDTH) ** 2)

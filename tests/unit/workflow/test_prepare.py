@@ -90,7 +90,12 @@ def test_known_effects_are_unknowns_of_the_model_and_no_candidates(folder, need)
 
 @pytest.mark.parametrize(
     ("name", "got"),
-    [("object_displacement", "one effect"), ("phase_error", "random field"), ("timing", "effect family")],
+    [
+        ("object_displacement", "one effect"),
+        ("phase_error", "random field"),
+        ("blockage[pole]", "anywhere"),
+        ("timing", "effect family"),
+    ],
 )
 def test_what_cannot_be_known_is_refused(folder, name, got):
     change(folder, 'use = "all"', f'use = "all"\nknown = ["{name}"]')

@@ -1,0 +1,145 @@
+"""Effects that may act anywhere: where the scores of one are largest, and whether larger than chance lets them be.
+
+The score of an effect of one size is told at every place that it names (`Parameter.tried`) from the site gradients that the
+maps use too. The effect is then screened and fitted from its best place; that it was the best of many is paid for by the
+same maximum in every replicate.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Final
+
+import jax
+import numpy as np
+import numpyro.distributions as dist
+from jaxtyping import Float
+from scipy import stats
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.fitting.bootstrap import Replicates
+from dtprob.gap.fitting.fit import Fit
+from dtprob.gap.fitting.plausible import is_one_sided, nulls, places, prior_scale, sizes
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.tails import LOG_SMALLEST, effective_tests, family_wise
+from dtprob.gap.which.directions import surroundings
+
+_MOST_PRODUCTS: Final = 5e10
+"""Products of scores that are worth looking for the place of an effect; beyond, places are left out at random."""
+_FINER: Final = (512, 32)
+"""Places around which three times finer ones are looked at, and of these again."""
+_PORTION: Final = 4096
+"""Places whose scores are told in one run."""
+_WORTH_A_MOVE: Final = 0.05
+"""Chance below which an effect that is live elsewhere is moved, which costs a compilation."""
+
+
+@dataclass(frozen=True)
+class Placed:
+    """The best place of an effect.
+
+    Attributes:
+        p_value: of its score there, that it is the best of many places accounted for.
+        replicate_p: the same of each replicate at its own best place.
+        price: log of the effective number of places.
+    """
+
+    p_value: float
+    replicate_p: Float[np.ndarray, " replicate"]
+    price: float
+
+
+def place(problem: Problem, fitted: Fit, drawn: Replicates) -> tuple[Problem, Mapping[str, Placed]]:
+    """The problem with each effect that may act anywhere at its best place, and how that was found.
+
+    Args:
+        problem: the model and candidates on their data.
+        fitted: the effects that it has stay where they are.
+        drawn: site gradients of the data and of replicates at the fit.
+    """
+    left = [e for e in problem.effects if e.name not in fitted.effects]
+    searched = [e for e in left if _is_searched(e) and not drawn.gradients.keys().isdisjoint(e.rewrites)]
+    if not searched:
+        return problem, {}
+    around, live = surroundings(problem, fitted.x).grown(), {e.name for e in problem.live}
+    found, moved = {}, {}
+    for effect in searched:
+        found[effect.name], best = _best(problem, effect, around, drawn)
+        if found[effect.name].p_value < _WORTH_A_MOVE or effect.name not in live:
+            moved[effect.name] = _at(effect, best)
+    return problem.with_candidates([moved.get(e.name, e) for e in problem.effects]), found
+
+
+def _best(
+    problem: Problem, effect: Effect, around: Mapping[str, jax.Array], drawn: Replicates
+) -> tuple[Placed, np.ndarray]:
+    """How the best place of an effect was found, and its flat parameters there."""
+
+    def tails(points: np.ndarray) -> np.ndarray:
+        count = -(-len(points) // _PORTION) * _PORTION
+        padded = points[np.arange(count) % len(points)].reshape(-1, _PORTION, points.shape[1])
+        told = [problem.programs.place_scores(effect.name, around, drawn.gradients, part) for part in padded]
+        return _tails(np.concatenate(told)[: len(points)], one_sided=is_one_sided(effect))
+
+    points, spacing = _points(effect, sum(np.asarray(g).size for g in drawn.gradients.values()))
+    p = tails(points)
+    replicate_p, smallest = p[:, 1:].min(axis=0), float(p[:, 0].min())
+    best, own = points[int(np.argmin(p[:, 0]))], p[:, 0]
+    ways = np.array(list(itertools.product((-1, 0, 1), repeat=points.shape[1])))
+    ways = ways[~ways[:, (spacing == 0).all(axis=0)].any(axis=1)]
+    for kept in _FINER:
+        chosen = np.argsort(own)[:kept]
+        spacing = spacing[chosen] / 3
+        points = (points[chosen][:, None] + ways * spacing[:, None]).reshape(-1, points.shape[1])
+        spacing, own = np.repeat(spacing, len(ways), axis=0), tails(points)[:, 0]
+        if own.min() < smallest:
+            best, smallest = points[int(np.argmin(own))], float(own.min())
+    # What is looked at more finely in the data alone could have been in as many more places.
+    several = effective_tests(replicate_p) * len(ways)
+    chance = -np.expm1(several * np.log1p(-min(smallest, 1 - 1e-16)))
+    return Placed(float(chance), family_wise(replicate_p, replicate_p), float(np.log(several))), best
+
+
+def _is_searched(effect: Effect) -> bool:
+    """Whether an effect names places at which it is looked for, and has one size to be looked for."""
+    looked = any(p.tried for p in effect.parameters)
+    return looked and effect.kind == "mean" and not effect.distributions and len(sizes(effect)) == 1
+
+
+def _points(effect: Effect, entries: int) -> tuple[np.ndarray, np.ndarray]:
+    """Combinations (place, parameter) of the places that are tried, the size at its null, and how far apart they are."""
+    values = [np.array(p.tried or (p.null,)) for p in effect.parameters]
+    gaps = [np.gradient(v) if len(v) > 1 else np.zeros(1) for v in values]
+    points, spacing = (
+        np.stack(np.meshgrid(*v, indexing="ij"), -1).reshape(-1, len(v)) for v in (values, gaps)
+    )
+    most = max(int(_MOST_PRODUCTS / max(entries, 1)), 1)
+    if len(points) > most:
+        kept = np.random.default_rng(0).choice(len(points), most, replace=False)
+        points, spacing = points[kept], spacing[kept]
+    return points, spacing
+
+
+def _tails(scores: Float[np.ndarray, "place n"], *, one_sided: bool) -> Float[np.ndarray, "place n"]:
+    """p-value of each score, by its standard deviation over the replicates, of which the score itself is none."""
+    square = scores[:, 1:] ** 2
+    total, count = square.sum(axis=1, keepdims=True), square.shape[1]
+    variance = np.concatenate([total / count, (total - square) / (count - 1)], axis=1)
+    seen = variance > 1e-12 * variance.max(initial=1e-300)
+    t = np.where(seen, scores, 0.0) / np.sqrt(np.where(seen, variance, 1.0))
+    p = stats.t.sf(t, count - 1) if one_sided else 2 * stats.t.sf(np.abs(t), count - 1)
+    return np.maximum(np.where(seen, p, 1.0), np.exp(LOG_SMALLEST))
+
+
+def _at(effect: Effect, point: Float[np.ndarray, " parameter"]) -> Effect:
+    """The effect with its places here."""
+    moved = iter(np.where(places(effect), point, nulls(effect)).tolist())
+    return replace(effect, parameters=tuple(_moved(p, next(moved)) for p in effect.parameters))
+
+
+def _moved(parameter: Parameter, to: float) -> Parameter:
+    if not parameter.tried:
+        return parameter
+    return replace(parameter, prior=dist.Normal(to, float(prior_scale(parameter.prior))), null=to)

@@ -1,0 +1,94 @@
+"""Effects that may act anywhere: the best place is found, and paid for."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.bootstrap import replicate
+from dtprob.gap.fitting.projection import project
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.gap.which.directions import surroundings
+from dtprob.gap.which.places import place
+from dtprob.gap.which.screen import screen
+from tests.unit.gap.examples import PLACES, WIDTH, bump, draw, inputs, line, raised, ripple
+
+
+@pytest.fixture(scope="module")
+def problem():
+    return Problem(line, draw("line"), [bump(), ripple()])
+
+
+@pytest.fixture(scope="module")
+def looked(problem):
+    """Shift of the mean and seed -> problem, base fit, projection and replicates on these data."""
+
+    def look(shift=0.0, seed=1, of=problem):
+        data = draw("line", seed=seed, shift=shift)
+        other = Problem(line, data, of.effects)
+        base = fitting.fit(other, np.zeros(other.dimension))
+        projection = project(other, base)
+        settings = replace(Settings(), replicates=99)
+        return other, base, projection, replicate(other, base, projection, jax.random.key(seed), settings)
+
+    return look
+
+
+def test_scores_at_places_are_derivatives_in_the_size(looked):
+    problem, base, _, drawn = looked()
+    points = np.array([[0.0, -0.7], [0.0, 1.1]])
+    around = surroundings(problem, base.x).grown()
+    told = problem.programs.place_scores("bump", around, drawn.gradients, points)
+    x, gradients = np.asarray(inputs()), np.asarray(drawn.gradients["mean"])
+    by_hand = [(gradients * raised(x, at, 1.0)).sum(axis=(1, 2)) for at in points[:, 1]]
+    np.testing.assert_allclose(told, by_hand, rtol=1e-4, atol=1e-4 * np.abs(by_hand).max())
+
+
+@pytest.mark.parametrize("at", [-0.93, 0.41])
+def test_the_best_place_is_found_between_those_that_are_tried(looked, at):
+    shift = raised(inputs(), at, 2.5)
+    problem, base, projection, drawn = looked(shift)
+    placed, found = place(problem, base, drawn)
+    moved = next(e for e in placed.effects if e.name == "bump").parameters[1]
+    assert abs(moved.null - at) < 0.5 * WIDTH
+    assert float(moved.prior.mean) == moved.null
+    assert found["bump"].p_value < 1e-4
+    assert 1 < np.exp(found["bump"].price) < 9 * len(PLACES)
+    seen = screen(placed, base, projection, drawn, Settings(), placed=found)
+    assert seen.adjusted[seen.names.index("bump")] < 1e-3
+    live = placed.with_live(["bump"])
+    step = seen.step["bump"]
+    x = live.translate(base.x, placed)
+    x[live.layout["bump.c"].offset] = step[0]
+    fitted = fitting.fit(live, x, ["bump"])
+    assert abs(fitted.x[live.layout["bump.at"].offset] - at) < 0.2 * WIDTH
+    assert fitted.log_evidence > base.log_evidence + 10
+
+
+def test_an_effect_of_one_side_is_looked_for_on_that_side(looked):
+    sided = Problem(line, draw("line"), [bump(dist.HalfNormal(2.0))])
+    below, base, _, drawn = looked(-raised(inputs(), 0.4, 1.5), of=sided)
+    assert place(below, base, drawn)[1]["bump"].p_value > 0.01
+    above, base, _, drawn = looked(raised(inputs(), 0.4, 1.5), of=sided)
+    assert place(above, base, drawn)[1]["bump"].p_value < 1e-4
+
+
+def test_an_effect_that_is_fitted_stays_where_it_is(looked):
+    problem, base, _, drawn = looked(raised(inputs(), 0.4, 1.5))
+    same, found = place(problem, replace(base, effects=("bump",)), drawn)
+    assert same is problem
+    assert not found
+
+
+def test_a_live_effect_that_moves_is_compiled_anew_and_others_are_not(looked):
+    problem, base, _, drawn = looked(raised(inputs(), 0.4, 1.5))
+    live = problem.with_live(["bump", "ripple"])
+    moved, _ = place(live, replace(base, x=live.translate(base.x, problem)), drawn)
+    assert [e.name for e in moved.live] == ["ripple"]
+    again = moved.with_live(["bump", "ripple"])
+    at = again.layout["bump.at"].offset
+    assert again.null()[at] == next(e for e in moved.effects if e.name == "bump").parameters[1].null
