@@ -5,8 +5,9 @@
 """
 
 from dtprob.effects.distributions import ComplexStudentT, replace_base
-from dtprob.effects.effect import Context, Effect, Parameter, Rewriting, with_effects
+from dtprob.effects.effect import Context, Effect, Parameter
 from dtprob.effects.library import FAMILIES, catalogue, summaries
+from dtprob.effects.rewriting import Rewriting, with_effects
 
 __all__ = [
     "FAMILIES",

@@ -6,19 +6,14 @@ sampled ones, while the model runs, so the same effect works on every model that
 
 from __future__ import annotations
 
-import functools
-import inspect
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
-import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
-from numpyro.primitives import Messenger
 
 from dtprob.errors import InputError
 
@@ -28,7 +23,6 @@ type Model = Callable[..., Any]
 type EffectKind = Literal["mean", "variance"]
 
 FIELD = "field"
-_ADDED = "__dtprob_effects__"
 
 
 @dataclass(frozen=True)
@@ -53,10 +47,22 @@ class Parameter:
     is_place: bool = False
     tried: tuple[float, ...] = ()
 
+    def __post_init__(self) -> None:
+        """Check that what is looked for at several values is one place."""
+        if len(self.tried) and not (self.is_place and not self.shape and isinstance(self.prior, dist.Normal)):
+            expected = "is_place=True and a normal prior of one number where values are tried"
+            got = f"is_place={self.is_place}, {type(self.prior).__name__} of shape {self.shape}"
+            raise InputError(f"parameter {self.name}", expected, got, "Leave tried out, or make it a place.")
+
     @property
     def shape(self) -> tuple[int, ...]:
         """Shape of the parameter."""
         return tuple(self.prior.batch_shape) + tuple(self.prior.event_shape)
+
+    @property
+    def size(self) -> int:
+        """Number of its entries."""
+        return int(np.prod(self.shape, dtype=int))
 
     @property
     def is_one_sided(self) -> bool:
@@ -134,6 +140,15 @@ class Effect:
         if not names or len(set(names)) < len(names):
             got = ", ".join(names) or "none"
             raise InputError(f"effect {self.name}", "parameters of different names", got, "Name each once.")
+        is_looked_for = any(p.tried for p in self.parameters)
+        n_size = sum(p.size for p in self.parameters if not p.is_place)
+        if is_looked_for and (self.kind == "variance" or self.distributions or n_size != 1):
+            raise InputError(
+                f"effect {self.name} with places that are tried",
+                "a mean effect of one size that rewrites deterministic sites",
+                f"{self.kind}, {n_size} sizes, distributions of {', '.join(self.distributions) or 'no site'}",
+                "Leave tried out, or split the effect.",
+            )
         shapeless = bool(self.distributions) and self.field_shape is None
         if self.kind == "variance" and (len(names) != 1 or shapeless):
             raise InputError(
@@ -156,7 +171,7 @@ class Effect:
     @property
     def dimension(self) -> int:
         """Number of scalar parameters."""
-        return sum(int(np.prod(p.shape, dtype=int)) for p in self.parameters)
+        return sum(p.size for p in self.parameters)
 
     def site_name(self, parameter: str) -> str:
         """Name of the sample site of a parameter, or of the field, in an extended model."""
@@ -176,126 +191,3 @@ class Effect:
     def null(self) -> dict[str, Any]:
         """The parameters at which the effect does nothing."""
         return {p.name: jnp.full(p.shape, p.null) for p in self.parameters}
-
-
-class Rewriting(Messenger):
-    """NumPyro handler that applies effects with given parameters to every site they name.
-
-    Args:
-        fn: the model.
-        effects: applied in this order where several rewrite one site; those of a handler inside this one
-            come before. Whatever the order, an effect finds in its context the final values of earlier sites.
-        parameters: for each effect's name, its parameters by name. A variance effect without an entry
-            "field" draws it.
-        data: the model's data, for the effects' context.
-
-    Raises:
-        InputError: an effect returns a value whose shape or dtype the site cannot take.
-    """
-
-    def __init__(
-        self,
-        fn: Model | None,
-        effects: Sequence[Effect],
-        parameters: Mapping[str, Mapping[str, Any]],
-        data: Mapping[str, Any],
-    ) -> None:
-        super().__init__(fn)
-        self._effects, self._parameters, self._data = tuple(effects), parameters, data
-        self._seen: dict[str, Any] = {}
-        self._fields: dict[str, jax.Array] = {}
-
-    def __enter__(self) -> Any:
-        """Start a run: nothing seen, no field drawn."""
-        self._seen, self._fields = {}, {}
-        return super().__enter__()
-
-    def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Rewrite the value of a deterministic site, or the distribution of a sampled one."""
-        if msg["type"] not in ("deterministic", "sample"):
-            return
-        context = Context(self._data, self._seen)
-        for effect in self._effects:
-            if msg["type"] == "sample":
-                rewrite = effect.distributions.get(msg["name"])
-                if rewrite is not None:
-                    msg["fn"] = rewrite(msg["fn"], self._given(effect, msg, context), context)
-            elif (rewrite := effect.rewrites.get(msg["name"])) is not None:
-                value = rewrite(msg["value"], self._given(effect, msg, context), context)
-                msg["value"] = _fit(effect.name, msg["name"], msg["value"], value)
-
-    def postprocess_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Remember the value, after all handlers have seen it, for later sites."""
-        if msg["type"] in ("deterministic", "sample"):
-            self._seen[msg["name"]] = msg["value"]
-
-    def _given(self, effect: Effect, msg: Mapping[str, Any], context: Context) -> Mapping[str, Any]:
-        given = self._parameters[effect.name]
-        if effect.kind == "mean" or FIELD in given:
-            return given
-        if effect.name not in self._fields:
-            shape = effect.shape_of_field(msg["value"], context)
-            normal = dist.Normal(0.0, 1.0).expand(shape).to_event(len(shape))
-            # The field has its own shape, so the plates around the site must not expand it.
-            plates = [frame.name for frame in msg["cond_indep_stack"]]
-            name = effect.site_name(FIELD)
-            drawn = numpyro.sample(name, normal, infer={"block_plates": plates})
-            self._fields[effect.name] = jnp.asarray(drawn)
-        return {**given, FIELD: self._fields[effect.name]}
-
-
-def _fit(effect: str, site: str, old: Any, new: Any) -> jax.Array:
-    """The new value in the old dtype, after a check that it can stand where the old one stood."""
-    old, new = jnp.asarray(old), jnp.asarray(new)
-    pairs = zip(old.shape, new.shape, strict=True) if old.ndim == new.ndim else [(0, 1)]
-    if not all(before in (1, after) for before, after in pairs):
-        raise InputError(
-            f"effect {effect}, new value of site {site!r}",
-            f"shape {old.shape}, axes of size 1 allowed to grow",
-            f"{new.shape}",
-            "Return an array of the site's shape.",
-        )
-    if jnp.iscomplexobj(new) and not jnp.iscomplexobj(old):
-        raise InputError(
-            f"effect {effect}, new value of site {site!r}",
-            str(old.dtype),
-            str(new.dtype),
-            "Return real values.",
-        )
-    return new.astype(old.dtype)
-
-
-def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
-    """The model extended by effects whose parameters are latent sites named `effect.parameter`.
-
-    The extended model has the signature, axes and cluster of the base model, and is as much a model as it.
-
-    Effects apply in the order listed, and those of the model that is extended before those of the extension,
-    so nesting makes no difference: with_effects(with_effects(m, a), b) has the sites of
-    with_effects(m, a + b) with the same values and densities. The order matters where several effects
-    rewrite one site.
-    """
-    effects, signature = tuple(effects), inspect.signature(model)
-
-    @functools.wraps(model)
-    def extended(*args: Any, **data: Any) -> Any:
-        data = {**dict(zip(signature.parameters, args, strict=False)), **data}
-        parameters = {
-            effect.name: {
-                p.name: numpyro.sample(effect.site_name(p.name), p.prior) for p in effect.parameters
-            }
-            for effect in effects
-        }
-        with Rewriting(None, effects, parameters, data):
-            return model(**data)
-
-    extended.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]
-    setattr(extended, _ADDED, (*effects_of(model), *effects))
-    return extended
-
-
-def effects_of(model: Model) -> tuple[Effect, ...]:
-    """The effects that `with_effects` has extended a model by, the first added first."""
-    while isinstance(model, functools.partial):
-        model = model.func
-    return getattr(model, _ADDED, ())

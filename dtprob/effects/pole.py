@@ -5,24 +5,31 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import Any, Final
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float
 from scipy.constants import speed_of_light
 
 from dtprob.effects.common import Data, Sites, half_normal, offers
 from dtprob.effects.effect import Effect, Parameter
-from dtprob.raytracing.paths import PathSet
+from dtprob.raytracing.paths import NONE, REFRACTION, PathSet
 
-_AZIMUTHS: Final = tuple(np.linspace(-np.pi, np.pi, 1024, endpoint=False).tolist())
-"""Directions from the transmitter in which a pole is looked for, rad: one may stand anywhere."""
-_SHARES: Final = np.geomspace(0.1, 0.7, 40)
-"""Distances at which it is looked for, as shares of the shortest path from the transmitter."""
+_SHARES: Final = (0.03, 0.4)
+"""Nearest and farthest distance at which a pole is looked for, as shares of the middle path from the transmitter."""
+_DISTANCES: Final = 44
+"""Distances between, in equal ratios."""
+_ZONE: Final = 0.4
+"""Step between azimuths, as a share of wavelength over distance: the scores of a pole change from one to the next."""
+_AZIMUTHS: Final = (512, 8192)
+"""Fewest and most azimuths."""
 _SAME: Final = 1e-3
 """Transmitters closer than this, in m, are one."""
 _MOST: Final = 8
 """Transmitters in front of which poles are looked for."""
+_UPRIGHT: Final = 0.9
+"""Surfaces whose normal is more upright than this turn no wave aside."""
 
 
 def poles(sites: Sites, data: Data) -> list[Effect]:
@@ -33,11 +40,14 @@ def poles(sites: Sites, data: Data) -> list[Effect]:
     found = list(_transmitters(paths))
     names = ["pole"] if len(found) == 1 else [f"pole_{index}" for index in range(len(found))]
     pairs = zip(found, names, strict=True)
-    return [_pole(*one, name) for one, name in pairs] if len(found) <= _MOST else []
+    return [_pole(*one, paths.frequency, name) for one, name in pairs] if len(found) <= _MOST else []
 
 
-def _pole(transmitter: np.ndarray, distances: tuple[float, ...], instance: str) -> Effect:
-    middle, spread = float(np.median(distances)), float(np.std(distances))
+def _pole(transmitter: np.ndarray, middle: float, frequency: float, instance: str) -> Effect:
+    distances = np.geomspace(_SHARES[0] * middle, _SHARES[1] * middle, _DISTANCES)
+    usual = float(np.sqrt(distances[0] * distances[-1]))
+    count = 2 * np.pi * usual * frequency / (_ZONE * speed_of_light)
+    azimuths = np.linspace(-np.pi, np.pi, int(np.clip(count, *_AZIMUTHS)), endpoint=False)
 
     def shade(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
         paths: PathSet = context["paths"]
@@ -50,51 +60,72 @@ def _pole(transmitter: np.ndarray, distances: tuple[float, ...], instance: str) 
         {"path_gain": shade},
         (
             half_normal("width", 0.5, "m"),
-            Parameter(
-                "azimuth", dist.Normal(0.0, np.pi / np.sqrt(3)), 0.0, "rad", is_place=True, tried=_AZIMUTHS
-            ),
-            Parameter("distance", dist.Normal(middle, spread), middle, "m", is_place=True, tried=distances),
+            _place("azimuth", 0.0, np.pi / np.sqrt(3), azimuths, "rad"),
+            _place("distance", usual, float(distances.std()), distances, "m"),
         ),
         instance=instance,
         physics="A pole or trunk that the scene lacks, this far from the transmitter, takes away the wave that would pass"
         " through it.",
-        source="Babinet's principle with a Gaussian profile: 1 - sqrt(j s^2 / 2) int exp(-pi x^2 / w^2) "
-        "exp(-j pi s^2 (x - b)^2 / 2) dx, s^2 = 2 (1/d1 + 1/d2) / wavelength; ITU-R P.526-15, section 4.",
+        source="Babinet's principle: what passes exp(-pi x^2 / w^2) is gone, int exp(-j k (r1(x) + r2(x) - r)) dx "
+        "sqrt(j (1/r1 + 1/r2) / wavelength) (1 + cos b) / 2, b the turn; Born & Wolf, Principles of Optics, 8.3.",
         requires=("paths",),
     )
 
 
+def _place(name: str, centre: float, spread: float, tried: np.ndarray, unit: str) -> Parameter:
+    return Parameter(
+        name, dist.Normal(centre, spread), centre, unit, is_place=True, tried=tuple(tried.tolist())
+    )
+
+
 def _removed(paths: PathSet, width: Any, azimuth: Any, distance: Any) -> Complex[Array, "link path"]:
-    """Share of the field of each path that an upright Gaussian screen takes away, to all orders of its width.
+    """Share of the field of each path that an upright Gaussian screen takes away, detours to second order in its breadth.
 
     Args:
-        paths: of all links.
+        paths: of all links; unfolded, so that the receiver of a reflected path stands behind the wall.
         width: integral of the screen's profile over its breadth, m.
         azimuth: of the screen as seen from the transmitter, rad.
         distance: of the screen from the transmitter, m.
     """
-    departure = jnp.asarray(paths.departure)
-    level = jnp.hypot(departure[..., 0], departure[..., 1])
+    departure, length = jnp.asarray(paths.departure), jnp.asarray(paths.length)
+    level, wavelength = jnp.hypot(departure[..., 0], departure[..., 1]), speed_of_light / paths.frequency
+    is_seen = (level > 0.1) & (length > 0)
+    total, height = jnp.where(is_seen, level * length, 1.0), departure[..., 2] * length
     turn = jnp.arctan2(departure[..., 1], departure[..., 0]) - azimuth
-    ahead, beside = jnp.cos(turn), jnp.sin(turn)
-    total = level * jnp.asarray(paths.length)
-    is_hit = (ahead > 0.2) & (total * jnp.maximum(ahead, 0.2) > 1.05 * distance) & (level > 0.1)
-    ahead, total = jnp.where(is_hit, ahead, 1.0), jnp.where(is_hit, total, 2.0 * distance)
-    before = distance / ahead  # on the ground, from the transmitter to the screen
-    offset = distance * jnp.where(is_hit, beside, 0.0) / ahead
-    wavelength = speed_of_light / paths.frequency
-    curvature = 2 / wavelength * jnp.where(is_hit, level, 1.0) * (1 / before + 1 / (total - before))
-    spread = 1.0 + 0.5j * curvature * width**2
-    field = (
-        width * jnp.sqrt(0.5j * curvature / spread) * jnp.exp(-0.5j * np.pi * curvature * offset**2 / spread)
-    )
-    return jnp.where(is_hit, field, 0.0)
+    ahead, beside = total * jnp.cos(turn) - distance, total * jnp.sin(turn)  # from the screen to the receiver
+    after = jnp.maximum(jnp.sqrt(ahead**2 + beside**2 + 1e-12), 0.1 * distance)
+    way = jnp.hypot(distance + after, height)
+    slope = (distance + after) / way  # the way past the screen rises, too
+    detour = (distance + after - total) * (distance + after + total) / (way + jnp.hypot(total, height))
+    sine, cosine = beside / after, ahead / after
+    gradient, curvature = -slope * sine, slope * (1 / distance + cosine**2 / after)
+    spread = 1.0 + 1j * curvature * width**2 / wavelength
+    aside = jnp.exp(-np.pi * (gradient * width / wavelength) ** 2 / spread)
+    strength = jnp.sqrt(1j * slope * (1 / distance + 1 / after) / (wavelength * spread))
+    strength = strength * total / (distance + after) * (1 + cosine) / 2
+    field = width * strength * aside * jnp.exp(-2j * np.pi * detour / wavelength)
+    free = jax.nn.sigmoid((_first_leg(paths) - distance) / (0.1 * distance))
+    return jnp.where(is_seen, free * field, 0.0)
 
 
-def _transmitters(paths: PathSet) -> Iterator[tuple[np.ndarray, tuple[float, ...]]]:
-    """Places of transmitters that two links or more share, and the distances of poles before them."""
+def _first_leg(paths: PathSet) -> Float[Array, "link path"]:
+    """Level distance from the transmitter to where a wall first turns the path aside; infinite where none does."""
+    turns = (jnp.asarray(paths.interaction) != NONE) & (jnp.asarray(paths.interaction) != REFRACTION)
+    turns &= jnp.abs(jnp.asarray(paths.normal)[..., 2]) < _UPRIGHT
+    vertex = jnp.asarray(paths.vertex)[..., :2]
+    start = jnp.broadcast_to(jnp.asarray(paths.tx_position)[:, None, None, :2], vertex[..., :1, :].shape)
+    legs = jnp.diff(vertex, axis=-2, prepend=start)
+    reached = jnp.cumsum(jnp.hypot(legs[..., 0], legs[..., 1]), axis=-1)
+    return jnp.min(jnp.where(turns, reached, jnp.inf), axis=-1, initial=jnp.inf)
+
+
+def _transmitters(paths: PathSet) -> Iterator[tuple[np.ndarray, float]]:
+    """Places of transmitters that two links or more share, and the middle length of their paths."""
     mask, positions, lengths = (np.asarray(v) for v in (paths.mask, paths.tx_position, paths.length))
-    for transmitter in np.unique(positions.round(3), axis=0):
+    left = np.ones(len(positions), bool)
+    while left.any():
+        transmitter = positions[int(left.argmax())]
         own = np.all(np.abs(positions - transmitter) < _SAME, axis=-1)
+        left &= ~own
         if own.sum() > 1 and mask[own].any():
-            yield transmitter, tuple((_SHARES * lengths[own][mask[own]].min()).tolist())
+            yield transmitter, float(np.median(lengths[own][mask[own]]))

@@ -50,29 +50,36 @@ def doppler(velocity: Float[np.ndarray, "3"], limit: float = 100.0) -> Impairmen
 def blockage(azimuth: float, distance: float, limit: float = 10.0) -> Impairment:
     """An opaque upright strip stands near the transmitter; size is its width in m.
 
-    The field behind it follows from Fresnel's integrals and Babinet's principle, as for two knife edges.
-    Source: ITU-R P.526-15, section 4.
+    The field behind it follows from Fresnel's integrals and Babinet's principle, as for two knife edges; the parameter of
+    each is twice the root of its detour in wavelengths. Source: ITU-R P.526-15, section 4.
 
     Args:
         azimuth: where its centre stands as seen from the transmitter, rad.
         distance: from the transmitter, m; shorter than every path.
         limit: of the width.
     """
+    towards = np.array([np.cos(azimuth), np.sin(azimuth)])
+    across = np.array([-towards[1], towards[0]])
 
     def shade(world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        away = rays.unfolded
-        level = np.hypot(away[..., 0], away[..., 1])
-        turn = np.angle(np.exp(1j * (np.arctan2(away[..., 1], away[..., 0]) - azimuth)))
-        ahead = np.abs(turn) < np.pi / 2
-        beside = distance * np.tan(np.where(ahead, turn, 0.0))
-        near = np.where(ahead, distance / np.cos(np.where(ahead, turn, 0.0)), 1.0)
-        near = near * rays.length / np.where(level > 0, level, 1.0)
-        scale = np.sqrt(2 / world.wavelength * (1 / near + 1 / np.maximum(rays.length - near, near)))
-        first, last = (_fresnel((beside + side * size / 2) * scale) for side in (-1, 1))
+        receiver, length = rays.unfolded[..., :2], rays.length
+        edges = (_edge(distance * towards + side * size / 2 * across, rays) for side in (-1, 1))
+        first, last = (_fresnel(2 * side * np.sqrt(detour / world.wavelength)) for side, detour in edges)
+        ahead = (receiver @ towards > 0) & (length > distance)
         return rays.scaled(np.where(ahead, 1 - (1 + 1j) / 2 * (last - first), 1.0))
 
     detail = {"azimuth": azimuth, "distance": distance}
     return Impairment("blockage", "m", limit, rays=shade, detail=detail)
+
+
+def _edge(
+    edge: Float[np.ndarray, "2"], rays: Rays
+) -> tuple[Float[np.ndarray, "link instant path"], Float[np.ndarray, "link instant path"]]:
+    """On which side of each ray an upright edge stands, -1 or 1, and how much longer the way past it is, m."""
+    receiver = rays.unfolded[..., :2]
+    side = np.sign(receiver[..., 0] * edge[1] - receiver[..., 1] * edge[0])
+    level = np.hypot(*edge) + np.linalg.norm(receiver - edge, axis=-1)
+    return side, np.maximum(np.hypot(level, rays.unfolded[..., 2]) - rays.length, 0.0)
 
 
 def _fresnel(v: Float[np.ndarray, "*n"]) -> Complex[np.ndarray, "*n"]:

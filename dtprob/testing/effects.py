@@ -11,7 +11,8 @@ import numpy as np
 import numpyro
 from numpyro import handlers
 
-from dtprob.effects.effect import FIELD, Effect, Parameter, Rewriting
+from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.effects.rewriting import Rewriting
 from dtprob.models.declaration import Model
 from dtprob.testing.contract import expect, same
 

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 import jax
 import numpy as np
 
-from dtprob.effects.effect import effects_of
+from dtprob.effects.rewriting import effects_of
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import means_among
 from dtprob.gap.fitting.marginal import settled

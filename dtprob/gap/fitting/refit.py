@@ -107,6 +107,8 @@ def starting_points(
         return []
     index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
     scale, sided = scales(effect), sides(effect)
+    x = x.copy()
+    x[index] = nulls(effect)  # a place may have moved since the effect was last tried
     one_step = x.copy()
     if step is not None:
         moved = np.clip(step, -4 * scale, 4 * scale)

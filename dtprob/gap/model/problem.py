@@ -120,12 +120,20 @@ class Problem:
         return other
 
     def with_candidates(self, effects: Sequence[Effect]) -> Problem:
-        """The same problem with candidates of the same names but other nulls; live ones among these are live no more."""
-        _ = self.programs, self.float_sites, self.field_shapes, self._draw  # made once, then shared
-        other, kept = copy(self), {id(e) for e in effects}
+        """The same problem with candidates of the same names but other nulls and priors; nothing is compiled anew.
+
+        Points stay what they are: an effect that no fit holds may still be where its null was before.
+        """
+        _ = (
+            self.programs,
+            self.float_sites,
+            self.field_shapes,
+            self._draw,
+            self.compiled,
+        )  # shared: they know no nulls
+        other, by_name = copy(self), {e.name: e for e in effects}
         other.effects = tuple(effects)
-        if any(id(e) not in kept for e in self.live):
-            other.set_live(tuple(e for e in self.live if id(e) in kept))
+        other.live = tuple(by_name[e.name] for e in self.live)
         return other
 
     def with_volume(self, volume: Volume | None) -> Problem:

@@ -17,7 +17,7 @@ from dtprob.models.declaration import Data, split_static
 
 TRIALS: Final = 16
 """Sizes of each effect that are tried in one run."""
-_PLACES: Final = 128
+_PLACES: Final = 96
 """Places of an effect whose tangents are held at once."""
 
 

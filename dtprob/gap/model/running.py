@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from numpyro import handlers
 from numpyro.primitives import Messenger
 
-from dtprob.effects.effect import FIELD, Effect, Rewriting
+from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.rewriting import Rewriting
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import Layout, fold, transform_of
 from dtprob.gap.model.rows import Rows

@@ -9,7 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.effects.effect import FIELD, Context, Effect, Rewriting
+from dtprob.effects.effect import FIELD, Context, Effect
+from dtprob.effects.rewriting import Rewriting
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import transform_of
 from dtprob.gap.model.running import Arrays, Runner, observations

@@ -45,7 +45,7 @@ def next_measurement(
     if not causes or len(causes[0].alias_class) < 2:
         return None
     found = evidence.explanations
-    here = evidence.problem.with_live([name for names in causes[0].alias_class for name in names])
+    here = evidence.last.problem.with_live([name for names in causes[0].alias_class for name in names])
     fits = [_moved(here, found[names]) for names in causes[0].alias_class]
     again = designs_of(here, here, fits, _AGAIN)
     candidates = list(again)

@@ -9,7 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from dtprob.effects.effect import Effect, Parameter, with_effects
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.effects.rewriting import with_effects
 from dtprob.gap.diagnosis import Size
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.informed import informed

@@ -28,6 +28,8 @@ def best_pairs(
     information: np.ndarray,
     score: np.ndarray,
     alone: np.ndarray,
+    *,
+    price: np.ndarray,
 ) -> tuple[Pair, ...]:
     """The best pairs by Bayesian subset search on scores and their information.
 
@@ -37,12 +39,13 @@ def best_pairs(
         information: J (coordinate, coordinate), nuisances adjusted for.
         score: u (coordinate,), likewise.
         alone: log Bayes factor of each effect alone.
+        price: what each costs besides, in nats.
     """
     chosen = sorted(np.argsort(-alone)[:_MOST].tolist())
     found: list[Pair] = []
     for i, j in itertools.combinations(chosen, 2):
         both = np.concatenate([groups[i], groups[j]])
         scale = np.concatenate([scales(effects[i]), scales(effects[j])])
-        value = log_bayes_factor(information[np.ix_(both, both)], score[both], scale)
+        value = log_bayes_factor(information[np.ix_(both, both)], score[both], scale) - price[[i, j]].sum()
         found.append(Pair((effects[i].name, effects[j].name), value))
     return tuple(sorted(found, key=lambda pair: -pair.log_bayes_factor)[:_KEPT])

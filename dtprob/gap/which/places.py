@@ -27,13 +27,15 @@ from dtprob.gap.tails import LOG_SMALLEST, effective_tests, family_wise
 from dtprob.gap.which.directions import surroundings
 
 _MOST_PRODUCTS: Final = 5e10
-"""Products of scores that are worth looking for the place of an effect; beyond, places are left out at random."""
+"""Products of scores that are worth looking for the places of effects; beyond, places are left out."""
 _FINER: Final = (512, 32)
 """Places around which three times finer ones are looked at, and of these again."""
-_PORTION: Final = 4096
+_PORTION: Final = 576
 """Places whose scores are told in one run."""
-_WORTH_A_MOVE: Final = 0.05
-"""Chance below which an effect that is live elsewhere is moved, which costs a compilation."""
+
+
+type Grid = tuple[Float[np.ndarray, "place parameter"], Float[np.ndarray, "place parameter"]]
+"""Places as flat parameters, and how far apart neighbours are."""
 
 
 @dataclass(frozen=True)
@@ -63,43 +65,54 @@ def place(problem: Problem, fitted: Fit, drawn: Replicates) -> tuple[Problem, Ma
     searched = [e for e in left if _is_searched(e) and not drawn.gradients.keys().isdisjoint(e.rewrites)]
     if not searched:
         return problem, {}
-    around, live = surroundings(problem, fitted.x).grown(), {e.name for e in problem.live}
+    around = surroundings(problem, fitted.x).grown()
     found, moved = {}, {}
     for effect in searched:
-        found[effect.name], best = _best(problem, effect, around, drawn)
-        if found[effect.name].p_value < _WORTH_A_MOVE or effect.name not in live:
-            moved[effect.name] = _at(effect, best)
+        entries = sum(drawn.gradients[site].size for site in effect.rewrites if site in drawn.gradients)
+        grid = _grid(effect, int(_MOST_PRODUCTS / (entries * len(searched))))
+        found[effect.name], best = _best(problem, effect, around, drawn, grid)
+        moved[effect.name] = _at(effect, best)
     return problem.with_candidates([moved.get(e.name, e) for e in problem.effects]), found
 
 
 def _best(
-    problem: Problem, effect: Effect, around: Mapping[str, jax.Array], drawn: Replicates
+    problem: Problem,
+    effect: Effect,
+    around: Mapping[str, jax.Array],
+    drawn: Replicates,
+    grid: Grid,
 ) -> tuple[Placed, np.ndarray]:
     """How the best place of an effect was found, and its flat parameters there."""
+    one_sided = is_one_sided(effect)
 
-    def tails(points: np.ndarray) -> np.ndarray:
+    def told(points: np.ndarray) -> np.ndarray:
+        """How many standard deviations (place, n) the scores are from 0."""
         count = -(-len(points) // _PORTION) * _PORTION
         padded = points[np.arange(count) % len(points)].reshape(-1, _PORTION, points.shape[1])
-        told = [problem.programs.place_scores(effect.name, around, drawn.gradients, part) for part in padded]
-        return _tails(np.concatenate(told)[: len(points)], one_sided=is_one_sided(effect))
+        scores = [
+            problem.programs.place_scores(effect.name, around, drawn.gradients, part) for part in padded
+        ]
+        t = _standardised(np.concatenate(scores)[: len(points)])
+        return t if one_sided else np.abs(t)
 
-    points, spacing = _points(effect, sum(np.asarray(g).size for g in drawn.gradients.values()))
-    p = tails(points)
-    replicate_p, smallest = p[:, 1:].min(axis=0), float(p[:, 0].min())
-    best, own = points[int(np.argmin(p[:, 0]))], p[:, 0]
+    points, spacing = grid
+    t = told(points)
+    own, largest = t[:, 0], t.max(axis=0)
+    replicate_p, best = _tail(largest[1:], len(largest) - 2, one_sided=one_sided), points[int(own.argmax())]
     ways = np.array(list(itertools.product((-1, 0, 1), repeat=points.shape[1])))
     ways = ways[~ways[:, (spacing == 0).all(axis=0)].any(axis=1)]
     for kept in _FINER:
-        chosen = np.argsort(own)[:kept]
+        chosen = np.argsort(-own)[:kept]
         spacing = spacing[chosen] / 3
         points = (points[chosen][:, None] + ways * spacing[:, None]).reshape(-1, points.shape[1])
-        spacing, own = np.repeat(spacing, len(ways), axis=0), tails(points)[:, 0]
-        if own.min() < smallest:
-            best, smallest = points[int(np.argmin(own))], float(own.min())
+        spacing, own = np.repeat(spacing, len(ways), axis=0), told(points)[:, 0]
+        if own.max() > largest[0]:
+            best, largest[0] = points[int(own.argmax())], own.max()
     # What is looked at more finely in the data alone could have been in as many more places.
     several = effective_tests(replicate_p) * len(ways)
-    chance = -np.expm1(several * np.log1p(-min(smallest, 1 - 1e-16)))
-    return Placed(float(chance), family_wise(replicate_p, replicate_p), float(np.log(several))), best
+    p = _tail(largest[:1], len(largest) - 2, one_sided=one_sided)[0]
+    chance = float(-np.expm1(several * np.log1p(-min(p, 1 - 1e-16))))
+    return Placed(chance, family_wise(replicate_p, replicate_p), float(np.log(several))), best
 
 
 def _is_searched(effect: Effect) -> bool:
@@ -108,29 +121,29 @@ def _is_searched(effect: Effect) -> bool:
     return looked and effect.kind == "mean" and not effect.distributions and len(sizes(effect)) == 1
 
 
-def _points(effect: Effect, entries: int) -> tuple[np.ndarray, np.ndarray]:
+def _grid(effect: Effect, most: int) -> Grid:
     """Combinations (place, parameter) of the places that are tried, the size at its null, and how far apart they are."""
     values = [np.array(p.tried or (p.null,)) for p in effect.parameters]
     gaps = [np.gradient(v) if len(v) > 1 else np.zeros(1) for v in values]
     points, spacing = (
         np.stack(np.meshgrid(*v, indexing="ij"), -1).reshape(-1, len(v)) for v in (values, gaps)
     )
-    most = max(int(_MOST_PRODUCTS / max(entries, 1)), 1)
-    if len(points) > most:
-        kept = np.random.default_rng(0).choice(len(points), most, replace=False)
-        points, spacing = points[kept], spacing[kept]
-    return points, spacing
+    kept = np.linspace(0, len(points) - 1, min(max(most, 1), len(points))).round().astype(int)
+    return points[kept], spacing[kept]
 
 
-def _tails(scores: Float[np.ndarray, "place n"], *, one_sided: bool) -> Float[np.ndarray, "place n"]:
-    """p-value of each score, by its standard deviation over the replicates, of which the score itself is none."""
+def _standardised(scores: Float[np.ndarray, "place n"]) -> Float[np.ndarray, "place n"]:
+    """Scores over their standard deviation in the replicates, of which the score itself is none."""
     square = scores[:, 1:] ** 2
     total, count = square.sum(axis=1, keepdims=True), square.shape[1]
     variance = np.concatenate([total / count, (total - square) / (count - 1)], axis=1)
     seen = variance > 1e-12 * variance.max(initial=1e-300)
-    t = np.where(seen, scores, 0.0) / np.sqrt(np.where(seen, variance, 1.0))
-    p = stats.t.sf(t, count - 1) if one_sided else 2 * stats.t.sf(np.abs(t), count - 1)
-    return np.maximum(np.where(seen, p, 1.0), np.exp(LOG_SMALLEST))
+    return np.where(seen, scores, 0.0) / np.sqrt(np.where(seen, variance, 1.0))
+
+
+def _tail(t: Float[np.ndarray, " n"], freedom: int, *, one_sided: bool) -> Float[np.ndarray, " n"]:
+    """p-value of the largest of scores over their standard deviation, as if it had been the only one."""
+    return np.maximum(stats.t.sf(t, freedom) * (1 if one_sided else 2), np.exp(LOG_SMALLEST))
 
 
 def _at(effect: Effect, point: Float[np.ndarray, " parameter"]) -> Effect:

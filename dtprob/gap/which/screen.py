@@ -8,7 +8,7 @@ p-value over all candidates (Westfall & Young's min-p).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import jax
@@ -94,16 +94,15 @@ def screen(
     means = [e for e in candidates if e.kind == "mean"]
     fields = [e for e in candidates if e.kind == "variance"]
     around = surroundings(problem, fitted.x)
-    scores = mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
+    told = mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
+    scores = replace(told, price=np.array([placed[e.name].price if e.name in placed else 0.0 for e in means]))
     energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
     tested = field_tests(energy, [e.name for e in fields], len(drawn.projected))
     (mean_p, mean_z), null_p = _mean_tests(scores, scores.u[None]), _mean_tests(scores, scores.u_null)[0]
-    price = np.array([placed[e.name].price if e.name in placed else 0.0 for e in means])
     for k, found in ((k, placed[e.name]) for k, e in enumerate(means) if e.name in placed):
         mean_p[0, k], null_p[:, k] = found.p_value, 1.0
-        mean_z[0, k] = np.copysign(
-            stats.norm.isf(found.p_value / (1 if is_one_sided(means[k]) else 2)), mean_z[0, k]
-        )
+        z = stats.norm.isf(min(found.p_value / (1 if is_one_sided(means[k]) else 2), 1 - 1e-16))
+        mean_z[0, k] = z if is_one_sided(means[k]) else np.copysign(z, mean_z[0, k])
     replicate_p = null_p.min(axis=1, initial=1.0)
     # The replicates of fields and of places are the first of the same data sets.
     for others in (
@@ -114,7 +113,7 @@ def screen(
     smallest = np.concatenate([mean_p[0], tested.smallest])
     names = [e.name for e in (*means, *fields)]
     order = np.array([names.index(c.name) for c in candidates], int)
-    log_bf = np.concatenate([scores.log_bayes_factor - price, tested.log_bayes_factor])
+    log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
     return Screening(
         names=tuple(c.name for c in candidates),
         z=np.concatenate([mean_z[0], tested.z])[order],
@@ -132,7 +131,10 @@ def screen(
 
 @dataclass(frozen=True)
 class Scores:
-    """Adjusted scores of mean effects: u of the data and of the replicates, information, and what was projected away."""
+    """Adjusted scores of mean effects: u of the data and of the replicates, information, and what was projected away.
+
+    `price` is what the best of many places costs each effect, in nats.
+    """
 
     effects: tuple[Effect, ...]
     groups: tuple[np.ndarray, ...]
@@ -141,6 +143,7 @@ class Scores:
     information: np.ndarray
     total: np.ndarray
     coefficients: np.ndarray
+    price: np.ndarray
 
     def part(self, k: int) -> np.ndarray:
         """Information of one effect's own parameters."""
@@ -161,10 +164,9 @@ class Scores:
 
     @property
     def log_bayes_factor(self) -> np.ndarray:
-        """Of each effect, the scale of its prior mixed; see `dtprob.gap.fitting.plausible`."""
-        return np.array(
-            [self._evidence(effect, group) for effect, group in zip(self.effects, self.groups, strict=True)]
-        )
+        """Of each effect, the scale of its prior mixed, see `dtprob.gap.fitting.plausible`, its place paid for."""
+        pairs = zip(self.effects, self.groups, strict=True)
+        return np.array([self._evidence(effect, group) for effect, group in pairs]) - self.price
 
     def _evidence(self, effect: Effect, group: np.ndarray) -> float:
         """Places tell nothing beside the null."""
@@ -175,7 +177,9 @@ class Scores:
 
     def pairs(self) -> tuple[Pair, ...]:
         """The pairs that explain most together; costly, so made when asked for."""
-        return best_pairs(self.effects, self.groups, self.information, self.u, self.log_bayes_factor)
+        return best_pairs(
+            self.effects, self.groups, self.information, self.u, self.log_bayes_factor, price=self.price
+        )
 
 
 def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, found: Tangents) -> Scores:
@@ -199,7 +203,8 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
             u[group] += extra.score(values[extra.site][None])[0]
     u_null = np.concatenate([_replicate_scores(projection, found, *portion) for portion in drawn.portions()])
     information = (information + information.T) / 2
-    return Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients))
+    free = np.zeros(len(found.effects))
+    return Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients), free)
 
 
 def _replicate_scores(
@@ -265,7 +270,8 @@ def _detectable(scores: Scores, effect: Effect, settings: Settings) -> float:
     k = [e.name for e in scores.effects].index(effect.name)
     first = scores.groups[k][0]
     own = float(scores.information[first, first])
-    needed = stats.norm.isf(settings.level / (4 * max(len(scores.effects), 1))) + stats.norm.isf(0.1)
+    level = settings.level / (4 * max(len(scores.effects), 1) * np.exp(scores.price[k]))
+    needed = stats.norm.isf(level) + stats.norm.isf(0.1)
     return float(needed / np.sqrt(own)) if own > _NOTHING * scores.total[first] else float("inf")
 
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from dtprob.effects import catalogue
-from dtprob.effects.effect import Rewriting
 from dtprob.effects.network import FAMILIES
 from dtprob.effects.network.laws import tilted
+from dtprob.effects.rewriting import Rewriting
 from dtprob.models.declaration import declare, trace_model
 from dtprob.models.multi_access import multi_access, records
 from dtprob.testing import check_effect

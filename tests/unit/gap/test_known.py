@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.effects import Effect, Parameter, with_effects
-from dtprob.effects.effect import effects_of
+from dtprob.effects.rewriting import effects_of
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import model

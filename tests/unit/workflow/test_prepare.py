@@ -12,7 +12,7 @@ from numpyro.infer.util import log_density
 
 from dtprob.case import load_case
 from dtprob.data import ChannelData, read, write
-from dtprob.effects.effect import effects_of
+from dtprob.effects.rewriting import effects_of
 from dtprob.errors import InputError
 from dtprob.raytracing import storage
 from dtprob.workflow import prepare

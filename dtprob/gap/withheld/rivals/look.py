@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy import stats
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.bootstrap import Replicates, replicate
@@ -18,6 +20,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import gamma_tail
 from dtprob.gap.which.directions import surroundings, tangents
+from dtprob.gap.which.places import Placed, place
 from dtprob.gap.which.screen import Scores, mean_scores
 
 _NOTHING = 1e-300
@@ -76,13 +79,14 @@ def look(problem: Problem, fitted: Fit, key: jax.Array, settings: Settings) -> L
     drawn = replicate(
         problem, fitted, projection, key, replace(settings, replicates=settings.site_replicates)
     )
+    problem, placed = place(problem, fitted, drawn)
     left = [e for e in problem.effects if e.name not in fitted.effects]
     means = [e for e in left if e.kind == "mean"]
     fields = [e for e in left if e.kind == "variance"]
     around = surroundings(problem, fitted.x)
     found = tangents(around, means, problem.programs)
     scores = mean_scores(problem, projection, drawn, found)
-    u = np.concatenate([scores.u[None], scores.u_null])
+    u = _paid(scores, np.concatenate([scores.u[None], scores.u_null]), placed)
     energies = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
     energy = np.array([energies[e.name] for e in fields]) if fields else np.zeros((0, len(u), 1))
     square, size = _mean_gains(scores, u)
@@ -101,6 +105,17 @@ def look(problem: Problem, fitted: Fit, key: jax.Array, settings: Settings) -> L
         gain=gain,
         size=np.concatenate([size, np.ones(len(fields))]),
     )
+
+
+def _paid(scores: Scores, u: np.ndarray, placed: Mapping[str, Placed]) -> np.ndarray:
+    """Scores, those of effects at their best places only as large as their chance after the choice of the place."""
+    u = u.copy()
+    for effect, group in zip(scores.effects, scores.groups, strict=True):
+        if effect.name in placed:
+            found, own = placed[effect.name], group[sizes(effect)[0]]
+            p = np.minimum(np.array([found.p_value, *found.replicate_p]), 1 - 1e-16)
+            u[:, own] = stats.norm.isf(p) * np.sqrt(scores.information[own, own])
+    return u
 
 
 def chance(statistic: Float[np.ndarray, " n"]) -> float:

@@ -45,6 +45,8 @@ def test_links_that_a_cause_reaches(found):
     blocks = found([HERE], 1.2 * AT)
     assert {(b.axis, b.low, b.high) for b in blocks} == {("link", k, k) for k in range(4)}
     assert all(b.p_value < 0.01 and b.excess > 0 for b in blocks)
+    strongest = max(blocks, key=lambda b: b.excess)  # one of four that were looked at
+    assert strongest.p_value == pytest.approx(4 * stats.norm.sf(np.sqrt(2 * strongest.excess)), rel=1e-6)
 
 
 def test_neighbours_along_another_axis_are_one_block(found):

@@ -42,7 +42,7 @@ def alone(effects, groups, information, score):
 
 def test_a_pair_that_hides_itself_is_found(scores):
     single = alone(*scores)
-    found = best_pairs(*scores, single)
+    found = best_pairs(*scores, single, price=np.zeros(len(single)))
     assert found[0].names == ("e2", "e7")
     assert found[0].log_bayes_factor > single.max() + 5
     assert set(np.argsort(-single)[:2].tolist()) != {2, 7}  # one after another would not begin with both
@@ -56,6 +56,7 @@ def test_pairs_are_those_of_enumeration(scores):
         part, own = information[np.ix_(both, both)], score[both]
         every[f"e{i}", f"e{j}"] = log_bayes_factor(part, own, np.ones(len(both)))
     ranked = sorted(every, key=lambda names: -every[names])
-    found = best_pairs(*scores, alone(*scores))
+    single = alone(*scores)
+    found = best_pairs(*scores, single, price=np.zeros(len(single)))
     assert [pair.names for pair in found] == ranked[: len(found)]
     np.testing.assert_allclose([p.log_bayes_factor for p in found], [every[p.names] for p in found])

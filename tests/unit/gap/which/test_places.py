@@ -6,16 +6,23 @@ import jax
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from scipy import stats
 
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.errors import InputError
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bootstrap import replicate
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
+from dtprob.gap.view import view
 from dtprob.gap.which.directions import surroundings
 from dtprob.gap.which.places import place
 from dtprob.gap.which.screen import screen
+from dtprob.gap.which.trials import tried
 from tests.unit.gap.examples import PLACES, WIDTH, bump, draw, inputs, line, raised, ripple
+
+FAST = replace(Settings(), replicates=99)
 
 
 @pytest.fixture(scope="module")
@@ -32,8 +39,7 @@ def looked(problem):
         other = Problem(line, data, of.effects)
         base = fitting.fit(other, np.zeros(other.dimension))
         projection = project(other, base)
-        settings = replace(Settings(), replicates=99)
-        return other, base, projection, replicate(other, base, projection, jax.random.key(seed), settings)
+        return other, base, projection, replicate(other, base, projection, jax.random.key(seed), FAST)
 
     return look
 
@@ -84,11 +90,55 @@ def test_an_effect_that_is_fitted_stays_where_it_is(looked):
     assert not found
 
 
-def test_a_live_effect_that_moves_is_compiled_anew_and_others_are_not(looked):
-    problem, base, _, drawn = looked(raised(inputs(), 0.4, 1.5))
+def test_a_live_effect_that_moves_is_fitted_from_its_new_place(looked):
+    """Another effect is live after it, at a size that no fit may lose."""
+    shift = raised(inputs(), 0.4, 2.5) + 0.5 * np.sin(3 * inputs())
+    problem, base, _, _ = looked(shift)
     live = problem.with_live(["bump", "ripple"])
-    moved, _ = place(live, replace(base, x=live.translate(base.x, problem)), drawn)
-    assert [e.name for e in moved.live] == ["ripple"]
-    again = moved.with_live(["bump", "ripple"])
-    at = again.layout["bump.at"].offset
-    assert again.null()[at] == next(e for e in moved.effects if e.name == "bump").parameters[1].null
+    x = live.translate(base.x, problem)
+    x[live.layout["bump.at"].offset] = -1.7  # where it was tried before
+    beside = fitting.fit(live, x, ["ripple"])
+    seen = view(live, beside, jax.random.key(0), FAST)
+    assert seen.problem.compiled is live.compiled
+    assert [e.name for e in seen.problem.live] == ["bump", "ripple"]
+    null = next(e for e in seen.problem.live if e.name == "bump").parameters[1].null
+    assert abs(null - 0.4) < 0.5 * WIDTH
+    found = tried(seen, FAST, lambda _: None)
+    fitted, size = found.fits["bump"], found.problem.layout["ripple.c"].offset
+    assert abs(fitted.x[found.problem.layout["bump.at"].offset] - 0.4) < 0.3 * WIDTH
+    assert abs(fitted.x[size] - 0.5) < 0.3
+    fresh = Problem(line, live.data, seen.problem.effects).with_live(["bump", "ripple"])
+    again = fitting.fit(fresh, fitted.x, fitted.effects)
+    np.testing.assert_allclose(again.log_evidence, fitted.log_evidence, atol=1e-3)
+
+
+def test_what_is_not_there_has_a_negative_score(looked):
+    sided = Problem(line, draw("line"), [bump(dist.HalfNormal(2.0))])
+    problem, base, projection, drawn = looked(of=sided)
+    placed, found = place(problem, base, drawn)
+    seen = screen(placed, base, projection, drawn, Settings(), placed=found)
+    z = seen.z[seen.names.index("bump")]
+    np.testing.assert_allclose(stats.norm.sf(z), found["bump"].p_value, rtol=1e-6)
+    alone = replace(seen.scores, price=np.zeros(1))
+    np.testing.assert_allclose(
+        alone.log_bayes_factor - seen.scores.log_bayes_factor, found["bump"].price, rtol=1e-9
+    )
+
+
+@pytest.mark.parametrize(
+    ("parameters", "message"),
+    [
+        (lambda tried: (Parameter("c", dist.Normal(), tried=tried),), "is_place=True"),
+        (lambda tried: (Parameter("at", dist.HalfNormal(), is_place=True, tried=tried),), "normal prior"),
+        (
+            lambda tried: (
+                Parameter("c", dist.Normal().expand([2]).to_event(1)),
+                Parameter("at", dist.Normal(), is_place=True, tried=tried),
+            ),
+            "one size",
+        ),
+    ],
+)
+def test_what_cannot_be_looked_for_is_refused(parameters, message):
+    with pytest.raises(InputError, match=message):
+        Effect("odd", {"mean": lambda value, p, _: value + p["c"]}, parameters((0.0, 1.0)))
