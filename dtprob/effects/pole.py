@@ -28,6 +28,8 @@ _SAME: Final = 1e-3
 """Transmitters closer than this, in m, are one."""
 _MOST: Final = 8
 """Transmitters in front of which poles are looked for."""
+_ENDLESS: Final = 1e6
+"""Metres that no pole is away; a finite number has derivatives."""
 _UPRIGHT: Final = 0.9
 """Surfaces whose normal is more upright than this turn no wave aside."""
 
@@ -109,14 +111,14 @@ def _removed(paths: PathSet, width: Any, azimuth: Any, distance: Any) -> Complex
 
 
 def _first_leg(paths: PathSet) -> Float[Array, "link path"]:
-    """Level distance from the transmitter to where a wall first turns the path aside; infinite where none does."""
+    """Level distance from the transmitter to where a wall first turns the path aside; endless where none does."""
     turns = (jnp.asarray(paths.interaction) != NONE) & (jnp.asarray(paths.interaction) != REFRACTION)
     turns &= jnp.abs(jnp.asarray(paths.normal)[..., 2]) < _UPRIGHT
     vertex = jnp.asarray(paths.vertex)[..., :2]
     start = jnp.broadcast_to(jnp.asarray(paths.tx_position)[:, None, None, :2], vertex[..., :1, :].shape)
     legs = jnp.diff(vertex, axis=-2, prepend=start)
     reached = jnp.cumsum(jnp.hypot(legs[..., 0], legs[..., 1]), axis=-1)
-    return jnp.min(jnp.where(turns, reached, jnp.inf), axis=-1, initial=jnp.inf)
+    return jnp.min(jnp.where(turns, reached, _ENDLESS), axis=-1, initial=_ENDLESS)
 
 
 def _transmitters(paths: PathSet) -> Iterator[tuple[np.ndarray, float]]:

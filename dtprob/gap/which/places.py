@@ -133,7 +133,8 @@ def _grid(effect: Effect, most: int) -> Grid:
 
 
 def _standardised(scores: Float[np.ndarray, "place n"]) -> Float[np.ndarray, "place n"]:
-    """Scores over their standard deviation in the replicates, of which the score itself is none."""
+    """Scores over their standard deviation in the replicates, of which the score itself is none; 0 without a score."""
+    scores = np.where(np.isfinite(scores).all(axis=1, keepdims=True), scores, 0.0)
     square = scores[:, 1:] ** 2
     total, count = square.sum(axis=1, keepdims=True), square.shape[1]
     variance = np.concatenate([total / count, (total - square) / (count - 1)], axis=1)

@@ -1,6 +1,8 @@
 """A pole in front of a transmitter: the field that it takes away against Kirchhoff's integral, path by path."""
 
 import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from numpyro import handlers
@@ -82,6 +84,25 @@ def test_what_a_pole_takes_away(world, shaded, width, azimuth, share):
     for link, path in np.argwhere(free):
         exact = kirchhoff(pole, unfolded[link, path, :2], unfolded[link, path, 2], width, wavelength)
         np.testing.assert_allclose(found[link, path], exact, atol=0.02 * abs(1 - exact) + 1e-3)
+
+
+def test_every_path_has_a_derivative_in_the_width(world, pole):
+    """Exact where nothing is there yet, at any place, as the search for places takes it."""
+    place = {"azimuth": jnp.array(0.3), "distance": jnp.array(1.5)}
+    gain = jnp.ones(np.asarray(world.data["paths"].delay).shape, complex)
+
+    def moved(width):
+        return pole.rewrites["path_gain"](gain, {"width": width, **place}, world.data)
+
+    def both(width, distance):
+        return pole.rewrites["path_gain"](gain, {**place, "width": width, "distance": distance}, world.data)
+
+    points, ways = (jnp.zeros(()), place["distance"]), (jnp.ones(()), jnp.zeros(()))
+    slope = np.asarray(jax.jvp(both, points, ways)[1])
+    step = 1e-4
+    np.testing.assert_allclose(slope, np.asarray(moved(step) - moved(0.0)) / step, rtol=1e-3, atol=1e-3)
+    mask = np.asarray(world.data["paths"].mask)
+    assert np.count_nonzero(slope[mask]) > 3
 
 
 def test_behind_a_wall_a_pole_takes_nothing_away(shaded):
