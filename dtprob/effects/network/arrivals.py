@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import numpy as np
@@ -185,29 +185,38 @@ def drift(sites: Sites, data: Data) -> list[Effect]:
         return []
     effects: list[Effect] = []
     for device in range(clusters.devices):
+        for change, name in ((joined, f"device_{device}"), (thinned, f"device_{device}_falling")):
 
-        def slope(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
-            return of_device(value, clusters, device, p["log_odds"] * progress(value.shape[0])[..., None])
+            def grow(
+                value: Any,
+                p: Mapping[str, Any],
+                _: Mapping[str, Any],
+                device: int = device,
+                change: Callable[..., Any] = change,
+            ) -> Any:
+                amount = p["amount"] * progress(value.shape[0])[..., None, None]
+                return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, change(v, bit), amount))
 
-        effects.append(_drift({"arrival_logits": slope}, f"device_{device}", f"arrivals at device {device}"))
+            what = (
+                "a packet where it would have none"
+                if change is joined
+                else "no packet where it would have one"
+            )
+            text = f"Device {device} generates {what}, with a probability 1 - exp(-amount x) that grows."
+            effects.append(_drift({"arrival_logits": grow}, half_normal("amount", 1.0), name, text))
     if offers(sites, "reception_logits"):
 
         def fade(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
             return value + p["log_odds"] * progress(value.shape[0])[..., None] * np.arange(value.shape[2])
 
-        effects.append(_drift({"reception_logits": fade}, "reception", "each delivery"))
+        text = "The log-odds of each delivery change linearly, by this over the whole log."
+        effects.append(_drift({"reception_logits": fade}, normal("log_odds", 1.0), "reception", text))
     return effects
 
 
-def _drift(rewrites: Mapping[str, Any], instance: str, what: str) -> Effect:
-    return Effect(
-        "drift",
-        rewrites,
-        (normal("log_odds", 1.0),),
-        instance=instance,
-        physics=f"The log-odds of {what} change linearly from what the twin learned before, by this over the whole log.",
-        source="P exp(c x), x from 0 in the first window to 1 in the last.",
-    )
+def _drift(rewrites: Mapping[str, Any], size: Parameter, instance: str, physics: str) -> Effect:
+    source = "x from 0 in the first window, where all is as the twin has learned it, to 1 in the last."
+    return Effect("drift", rewrites, (size,), instance=instance, physics=physics, source=source)
 
 
 def _clusters(sites: Sites, data: Data) -> ClustersLike | None:

@@ -32,6 +32,7 @@ TABLES = {
 SHOWN = [
     "device_disconnected[device_1]", "arrival_rate_shift", "bursty_traffic[device_2]", "bursty_traffic[each_window]",
     "cross_cluster_traffic[0_with_2]", "cross_cluster_traffic[3_to_1]", "drift[device_0]", "drift[reception]",
+    "drift[device_0_falling]",
     "reception_shift[2_senders]", "capture", "near_far[device_0]", "bursty_channel", "bursty_channel[each_window]",
     "interferer", "interferer[device_2]", "ack_loss[device_3]", "duty_cycle[device_1]",
 ]  # fmt: skip
@@ -114,9 +115,9 @@ def test_the_disconnection_of_the_report(offered, data):
     np.testing.assert_allclose(after[0, 0, 0], [0.6, 0.0, 0.4, 0.0], atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["cross_cluster_traffic[3_to_0]", "drift[device_0]"])
-def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, data, name):
-    before, after = law(data, None), law(data, offered[name], log_odds=jnp.array(0.7))
+def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, data):
+    effect = offered["cross_cluster_traffic[3_to_0]"]
+    before, after = law(data, None), law(data, effect, log_odds=jnp.array(0.7))
     grown = after.reshape(-1, *after.shape[-2:])
     assert np.ptp(grown[:, 0, 1]) > 0.01
     first = before[0, 0, 0]
@@ -131,11 +132,21 @@ def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, da
     np.testing.assert_allclose(grown[:, 1], np.broadcast_to(before[0, 0, 1], grown[:, 1].shape), rtol=1e-6)
 
 
-def test_a_drift_begins_where_the_twin_has_learned(offered, data):
-    before, after = law(data, None), law(data, offered["drift[device_0]"], log_odds=jnp.array(0.7))
-    factor = (after[..., 2:] / after[..., :2]) / (before[..., 2:] / before[..., :2])
-    np.testing.assert_allclose(factor[0, 0, 0], 1.0, rtol=1e-6)
-    np.testing.assert_allclose(factor[-1, 0, 0], np.exp(0.7), rtol=1e-6)
+@pytest.mark.parametrize("falling", [False, True])
+def test_a_drift_begins_where_the_twin_has_learned(offered, data, falling):
+    name = f"drift[device_0{'_falling' if falling else ''}]"
+    before, after = (law(data, e, **p) for e, p in ((None, {}), (offered[name], {"amount": jnp.log(4.0)})))
+    with_ = before[0, 0, 0, 2:].sum()
+    share = 1 - 4.0 ** -np.linspace(0, 1, len(after))
+    expected = with_ * (1 - share) if falling else with_ + share * (1 - with_)
+    np.testing.assert_allclose(after[:, 0, 0, 2:].sum(axis=-1), expected, rtol=1e-6)
+    kept = [after[:, 0, 0, [i, i + 2]].sum(axis=-1) for i in range(2)]  # what its neighbour does
+    np.testing.assert_allclose(
+        kept, [[before[0, 0, 0, [i, i + 2]].sum()] * len(after) for i in range(2)], rtol=1e-6
+    )
+    np.testing.assert_allclose(
+        after[:, :, 1], np.broadcast_to(before[0, 0, 1], after[:, :, 1].shape), rtol=1e-6
+    )
 
 
 def test_a_busier_device_adds_packets_and_leaves_its_neighbour_alone(offered, data):
