@@ -95,7 +95,11 @@ def _check_null(  # noqa: PLR0917
     for name, message in plain.items():
         if message["type"] not in ("sample", "deterministic"):
             continue
-        unchanged = same(message["value"], at_null[name]["value"])
+        before, after = np.asarray(message["value"]), np.asarray(at_null[name]["value"])
+        grown = before.ndim == after.ndim and all(
+            n in (1, m) for n, m in zip(before.shape, after.shape, strict=True)
+        )
+        unchanged = grown and same(np.broadcast_to(before, after.shape), after)
         expect(unchanged, what, f"{name!r} unchanged at the null", "another value", remedy)
         if message["type"] == "sample" and name in effect.distributions:
             before, after = (np.asarray(m["fn"].log_prob(m["value"])) for m in (message, at_null[name]))

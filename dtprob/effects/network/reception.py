@@ -17,6 +17,10 @@ from dtprob.effects.network.laws import at, mix
 _MEMORY: Final = 0.7
 """Share of what was heard that is still remembered a slot later."""
 
+_LEAST: Final = 1e-12
+"""Probability below which the twin holds a number of deliveries impossible."""
+
+type Unheard = Callable[[Any, Mapping[str, Any], int], Float[Array, "episode slot delivery_count"]]
 type Other = Callable[[Any, Mapping[str, Any]], Float[Array, "episode slot delivery_count"]]
 
 
@@ -178,7 +182,7 @@ def ack_loss(sites: Sites, _data: Data) -> list[Effect]:
         other,
         physics="A delivery of device {device} goes unacknowledged with probability 1 - exp(-loss).",
         source="Thinning of the deliveries; exact for one delivery per slot.",
-        requires=("sending",),
+        requires=("sending", "log_reception"),
     )
 
 
@@ -195,7 +199,7 @@ def duty_cycle(sites: Sites, _data: Data) -> list[Effect]:
         "sleep",
         other,
         physics="Device {device} does not transmit in a share 1 - exp(-sleep) of the slots in which it is to.",
-        source="P_s becomes P_{s-1}; who is delivered to first order in the share.",
+        source="P_s becomes P_{s-1}, and none of the deliveries is the device's.",
         requires=("sending", "log_reception"),
     )
 
@@ -204,7 +208,7 @@ def _unheard(
     sites: Sites,
     family: str,
     parameter: str,
-    other: Callable[[Any, Mapping[str, Any], int], Any],
+    other: Unheard,
     *,
     physics: str,
     source: str,
@@ -230,16 +234,38 @@ def _unheard(
             family,
             {
                 "reception_logits": _mixed(lambda value, context: other(value, context, device), parameter),
-                "device_advantage": lambda value, p, _: value - p[parameter] * at(device, devices),
+                "device_advantage": lambda value, p, context: (
+                    value + _set_back(p[parameter], context, device, other)[..., None] * at(device, devices)
+                ),
             },
             (half_normal(parameter, 0.5),),
             instance=f"device_{device}",
             physics=physics.format(device=device),
             source=source,
-            requires=requires,
+            requires=(*requires, "deliveries"),
         )
 
     return [of(device) for device in range(devices)]
+
+
+def _set_back(
+    amount: Any, context: Mapping[str, Any], device: int, other: Unheard
+) -> Float[Array, "episode slot"]:
+    """What a device's log-odds of being heard change by, given how many are delivered in the slot.
+
+    In a share of the slots it is not heard. Given d deliveries of s senders it is heard with probability r d / s, r the
+    chance that the slot is none of these: odds of r (s - d) / (s - r d) over the others'.
+    """
+    senders, delivered = _senders(context), jnp.asarray(context["deliveries"])
+    logits = jnp.asarray(context["log_reception"])[senders]
+    law, elsewhere = (
+        jnp.take_along_axis(p, delivered[..., None], axis=-1)[..., 0]
+        for p in (jax.nn.softmax(logits), other(logits, context, device))
+    )
+    own = 1.0 / (1.0 + jnp.expm1(amount) * elsewhere / jnp.maximum(law, _LEAST))
+    is_open = (delivered > 0) & (delivered < senders) & _with(context, device)[..., 0]
+    senders, delivered = jnp.where(is_open, senders, 2), jnp.where(is_open, delivered, 1)
+    return jnp.where(is_open, jnp.log(own * (senders - delivered) / (senders - own * delivered)), 0.0)
 
 
 def _mixed(other: Other, parameter: str) -> Callable[[Any, Mapping[str, Any], Mapping[str, Any]], Any]:

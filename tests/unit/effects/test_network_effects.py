@@ -1,5 +1,8 @@
 """Effects on a network's traffic and channel: their contract, and what they do to laws that are known."""
 
+import itertools
+import math
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -58,16 +61,20 @@ def test_effects_keep_their_contract(offered, data, name):
     check_effect(offered[name], multi_access, data)
 
 
-def law(data, effect=None, site="arrival_logits", **parameters):
-    """Probabilities at a site under the tables, with an effect of given parameters."""
+def site_value(data, effect, site, **parameters):
+    """Value of a site under the tables, with an effect of given parameters."""
 
     def extended(**arguments):
         chosen = () if effect is None else (effect,)
         with Rewriting(None, chosen, {e.name: parameters for e in chosen}, arguments):
             multi_access(**arguments)
 
-    value = trace_model(extended, data, jax.random.key(0), TABLES)[site]["value"]
-    return np.asarray(jax.nn.softmax(value))
+    return trace_model(extended, data, jax.random.key(0), TABLES)[site]["value"]
+
+
+def law(data, effect=None, site="arrival_logits", **parameters):
+    """Probabilities at a site under the tables, with an effect of given parameters."""
+    return np.asarray(jax.nn.softmax(site_value(data, effect, site, **parameters)))
 
 
 def test_a_disconnected_device_generates_nothing_and_its_neighbour_as_before(offered, data):
@@ -213,3 +220,46 @@ def test_a_stranger_takes_its_share_of_the_deliveries(offered, data):
     )
     alone = np.asarray(jax.nn.softmax(changed))[senders == 1]
     np.testing.assert_allclose(alone[0], [0.2 + 0.25, 0.25 + 0.3, 0, 0, 0], atol=1e-6)
+
+
+def sets(devices, size):
+    return [set(one) for one in itertools.combinations(devices, size)]
+
+
+@pytest.mark.parametrize("name", ["ack_loss", "duty_cycle"])
+def test_who_is_heard_where_one_is_not(offered, data, name):
+    """Number and set of deliveries by enumeration, in every slot in which the device sends beside others."""
+    device, share = 1, 0.6
+    effect = offered[f"{name}[{device}]".replace("[", "[device_")]
+    amount = {p.name: -jnp.log1p(-share) for p in effect.parameters}
+    reception = law(data, effect, site="reception_logits", **amount)
+    advantage = np.asarray(site_value(data, effect, "device_advantage", **amount))
+    table = np.exp(np.asarray(TABLES["log_reception"]))
+    sending, delivered = np.asarray(data["sending"], bool), np.asarray(data["deliveries"])
+    seen = 0
+    for episode, slot in np.argwhere(sending[..., device] & (sending.sum(-1) > 1)):
+        senders = np.flatnonzero(sending[episode, slot]).tolist()
+        others, chance = [i for i in senders if i != device], {}
+        for count in range(len(senders) + 1):
+            for chosen in sets(senders, count):  # as it would have been
+                p = table[len(senders), count] / math.comb(len(senders), count)
+                chance[frozenset(chosen)] = chance.get(frozenset(chosen), 0.0) + (1 - share) * p
+                if name == "ack_loss":
+                    heard = frozenset(chosen - {device})
+                    chance[heard] = chance.get(heard, 0.0) + share * p
+        if name == "duty_cycle":
+            for count in range(len(others) + 1):
+                for chosen in sets(others, count):
+                    p = table[len(others), count] / math.comb(len(others), count)
+                    chance[frozenset(chosen)] += share * p
+        number = [sum(p for s, p in chance.items() if len(s) == k) for k in range(len(senders) + 1)]
+        np.testing.assert_allclose(reception[episode, slot, : len(senders) + 1], number, atol=1e-6)
+        count = int(delivered[episode, slot])
+        if 0 < count < len(senders):
+            odds = np.exp(advantage[episode, slot])
+            weights = {s: np.prod([odds[i] for i in s]) for s in chance if len(s) == count}
+            exact = sum(p for s, p in chance.items() if len(s) == count and device in s) / number[count]
+            own = sum(w for s, w in weights.items() if device in s) / sum(weights.values())
+            np.testing.assert_allclose(own, exact, atol=1e-6)
+            seen += 1
+    assert seen > 0
