@@ -140,9 +140,8 @@ class Effect:
         if not names or len(set(names)) < len(names):
             got = ", ".join(names) or "none"
             raise InputError(f"effect {self.name}", "parameters of different names", got, "Name each once.")
-        is_looked_for = any(p.tried for p in self.parameters)
         n_size = sum(p.size for p in self.parameters if not p.is_place)
-        if is_looked_for and (self.kind == "variance" or self.distributions or n_size != 1):
+        if self.is_looked_for and (self.kind == "variance" or self.distributions or n_size != 1):
             raise InputError(
                 f"effect {self.name} with places that are tried",
                 "a mean effect of one size that rewrites deterministic sites",
@@ -167,6 +166,11 @@ class Effect:
     def sites(self) -> tuple[str, ...]:
         """Names of the sites that the effect rewrites, deterministic ones first."""
         return (*self.rewrites, *self.distributions)
+
+    @property
+    def is_looked_for(self) -> bool:
+        """Whether it may act anywhere, and is looked for at many places before it is fitted."""
+        return any(p.tried for p in self.parameters)
 
     @property
     def dimension(self) -> int:

@@ -85,11 +85,15 @@ class Rewriting(Messenger):
         return {**given, FIELD: self._fields[effect.name]}
 
 
+def may_become(old: Sequence[int], new: Sequence[int]) -> bool:
+    """Whether a site of one shape may take a value of another: only axes of size 1 grow."""
+    return len(old) == len(new) and all(before in (1, after) for before, after in zip(old, new, strict=True))
+
+
 def _fit(effect: str, site: str, old: Any, new: Any) -> jax.Array:
     """The new value in the old dtype, after a check that it can stand where the old one stood."""
     old, new = jnp.asarray(old), jnp.asarray(new)
-    pairs = zip(old.shape, new.shape, strict=True) if old.ndim == new.ndim else [(0, 1)]
-    if not all(before in (1, after) for before, after in pairs):
+    if not may_become(old.shape, new.shape):
         raise InputError(
             f"effect {effect}, new value of site {site!r}",
             f"shape {old.shape}, axes of size 1 allowed to grow",

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Final
 
 import numpy as np
+from numpy.typing import ArrayLike
 from scipy import special
 
 LOG_SMALLEST: Final = -660.0
@@ -16,7 +17,12 @@ _BELOW: Final = 4
 
 def family_wise(p: np.ndarray, replicate_p: np.ndarray) -> np.ndarray:
     """Family-wise p-values by min-p: Sidak's form with the effective number of tests that the replicates show."""
-    return -np.expm1(effective_tests(replicate_p) * np.log1p(-np.minimum(p, 1 - 1e-16)))
+    return any_of(p, effective_tests(replicate_p))
+
+
+def any_of(p: np.ndarray, tests: float) -> np.ndarray:
+    """Sidak's p-values of the smallest of so many independent tests."""
+    return -np.expm1(tests * np.log1p(-np.minimum(p, 1 - 1e-16)))
 
 
 def effective_tests(replicate_p: np.ndarray) -> float:
@@ -28,6 +34,12 @@ def effective_tests(replicate_p: np.ndarray) -> float:
     quantiles = np.quantile(np.maximum(replicate_p, 1e-300), told)
     effective = np.log1p(-told) / np.log1p(-np.minimum(quantiles, 1 - 1e-12))
     return float(np.clip(np.max(effective), 1.0, 1e6))
+
+
+def deviation(p: ArrayLike, *, one_sided: bool) -> np.ndarray:
+    """Standard deviations from 0 at which a normal score has a p-value; at least 0 if it is two-sided."""
+    tail = np.asarray(p) / (1 if one_sided else 2)
+    return -special.ndtri(np.minimum(tail, 1 - 1e-16))
 
 
 def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -12,7 +12,7 @@ import numpyro
 from numpyro import handlers
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
-from dtprob.effects.rewriting import Rewriting
+from dtprob.effects.rewriting import Rewriting, may_become
 from dtprob.models.declaration import Model
 from dtprob.testing.contract import expect, same
 
@@ -96,10 +96,9 @@ def _check_null(  # noqa: PLR0917
         if message["type"] not in ("sample", "deterministic"):
             continue
         before, after = np.asarray(message["value"]), np.asarray(at_null[name]["value"])
-        grown = before.ndim == after.ndim and all(
-            n in (1, m) for n, m in zip(before.shape, after.shape, strict=True)
+        unchanged = may_become(before.shape, after.shape) and same(
+            np.broadcast_to(before, after.shape), after
         )
-        unchanged = grown and same(np.broadcast_to(before, after.shape), after)
         expect(unchanged, what, f"{name!r} unchanged at the null", "another value", remedy)
         if message["type"] == "sample" and name in effect.distributions:
             before, after = (np.asarray(m["fn"].log_prob(m["value"])) for m in (message, at_null[name]))

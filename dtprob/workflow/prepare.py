@@ -285,7 +285,7 @@ def _extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
         if offered[name].kind == "variance":
             expected = "effects with parameters of their own"
             raise InputError(where, expected, f"the random field {name}", "Leave it among the candidates")
-        if any(p.tried for p in offered[name].parameters):
+        if offered[name].is_looked_for:
             expected = "effects at a place of their own"
             raise InputError(
                 where, expected, f"{name}, which may be anywhere", "Leave it among the candidates"

@@ -14,10 +14,9 @@ from dtprob.effects.network.laws import (
     ClustersLike,
     clusters_of,
     from_then_on,
-    in_cluster_of,
     joined,
     last_arrival,
-    mix,
+    mixed_at,
     of_device,
     progress,
     repeated,
@@ -45,7 +44,7 @@ def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
             loss = p["loss"]
             if lasts:
                 loss = from_then_on(loss, value.shape[0], p["onset"])[:, None, None, None]
-            return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, thinned(v, bit), loss))
+            return mixed_at(value, clusters, device, thinned, loss)
 
         effects.append(
             Effect(
@@ -81,7 +80,7 @@ def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
     for device in range(clusters.devices):
 
         def add(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], device: int = device) -> Any:
-            return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, joined(v, bit), p["extra"]))
+            return mixed_at(value, clusters, device, joined, p["extra"])
 
         effects.append(
             Effect(
@@ -108,9 +107,7 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
 
         def follow(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], device: int = device) -> Any:
             last = last_arrival(context, clusters, device)[..., None]
-            return in_cluster_of(
-                value, clusters, device, lambda v, bit: mix(v, repeated(v, bit, last), p["persistence"])
-            )
+            return mixed_at(value, clusters, device, lambda v, bit: repeated(v, bit, last), p["persistence"])
 
         effects.append(
             Effect(
@@ -185,25 +182,11 @@ def drift(sites: Sites, data: Data) -> list[Effect]:
         return []
     effects: list[Effect] = []
     for device in range(clusters.devices):
-        for change, name in ((joined, f"device_{device}"), (thinned, f"device_{device}_falling")):
-
-            def grow(
-                value: Any,
-                p: Mapping[str, Any],
-                _: Mapping[str, Any],
-                device: int = device,
-                change: Callable[..., Any] = change,
-            ) -> Any:
-                amount = p["amount"] * progress(value.shape[0])[..., None, None]
-                return in_cluster_of(value, clusters, device, lambda v, bit: mix(v, change(v, bit), amount))
-
-            what = (
-                "a packet where it would have none"
-                if change is joined
-                else "no packet where it would have one"
-            )
+        more, fewer = "a packet where it would have none", "no packet where it would have one"
+        for change, name, what in ((joined, "", more), (thinned, "_falling", fewer)):
             text = f"Device {device} generates {what}, with a probability 1 - exp(-amount x) that grows."
-            effects.append(_drift({"arrival_logits": grow}, half_normal("amount", 1.0), name, text))
+            grow = {"arrival_logits": _growing(clusters, device, change)}
+            effects.append(_drift(grow, half_normal("amount", 1.0), f"device_{device}{name}", text))
     if offers(sites, "reception_logits"):
 
         def fade(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
@@ -212,6 +195,14 @@ def drift(sites: Sites, data: Data) -> list[Effect]:
         text = "The log-odds of each delivery change linearly, by this over the whole log."
         effects.append(_drift({"reception_logits": fade}, normal("log_odds", 1.0), "reception", text))
     return effects
+
+
+def _growing(clusters: ClustersLike, device: int, change: Callable[..., Any]) -> Callable[..., Any]:
+    def grow(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
+        amount = p["amount"] * progress(value.shape[0])[..., None, None]
+        return mixed_at(value, clusters, device, change, amount)
+
+    return grow
 
 
 def _drift(rewrites: Mapping[str, Any], size: Parameter, instance: str, physics: str) -> Effect:

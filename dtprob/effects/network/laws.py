@@ -128,6 +128,25 @@ def in_cluster_of(
     return jnp.where(at(cluster, logits.shape[-2])[:, None], changed, logits)
 
 
+def mixed_at(
+    logits: Float[Array, "*batch cluster outcome"],
+    clusters: ClustersLike,
+    device: int,
+    change: Callable[[Float[Array, "*batch cluster outcome"], int], Float[Array, "*batch cluster outcome"]],
+    amount: Any,
+) -> Float[Array, "*batch cluster outcome"]:
+    """Logits of all clusters' arrivals, `mix`ed with another law in the one that a device belongs to.
+
+    Args:
+        logits: of the joint arrivals of each cluster.
+        clusters: of the network.
+        device: whose cluster changes.
+        change: logits and the binary digit of the device -> probabilities of the other law.
+        amount: what `mix` takes, broadcasting to the logits.
+    """
+    return in_cluster_of(logits, clusters, device, lambda value, bit: mix(value, change(value, bit), amount))
+
+
 def of_device(
     logits: Float[Array, "*batch cluster outcome"], clusters: ClustersLike, device: int, log_odds: Any
 ) -> Float[Array, "*batch cluster outcome"]:

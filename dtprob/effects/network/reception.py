@@ -182,7 +182,6 @@ def ack_loss(sites: Sites, _data: Data) -> list[Effect]:
         other,
         physics="A delivery of device {device} goes unacknowledged with probability 1 - exp(-loss).",
         source="Thinning of the deliveries; exact for one delivery per slot.",
-        requires=("sending", "log_reception"),
     )
 
 
@@ -200,7 +199,6 @@ def duty_cycle(sites: Sites, _data: Data) -> list[Effect]:
         other,
         physics="Device {device} does not transmit in a share 1 - exp(-sleep) of the slots in which it is to.",
         source="P_s becomes P_{s-1}, and none of the deliveries is the device's.",
-        requires=("sending", "log_reception"),
     )
 
 
@@ -212,7 +210,6 @@ def _unheard(
     *,
     physics: str,
     source: str,
-    requires: tuple[str, ...],
 ) -> list[Effect]:
     """A part of what a device sends is not heard: another law of deliveries in that part, and fewer are its own.
 
@@ -223,7 +220,6 @@ def _unheard(
         other: (logits, context, device) -> probabilities of the number of deliveries in those slots.
         physics: with {device} where the device's number belongs.
         source: of the formula.
-        requires: sites that `other` reads.
     """
     if not offers(sites, "reception_logits", "device_advantage"):
         return []
@@ -242,7 +238,7 @@ def _unheard(
             instance=f"device_{device}",
             physics=physics.format(device=device),
             source=source,
-            requires=(*requires, "deliveries"),
+            requires=("sending", "deliveries", "log_reception"),
         )
 
     return [of(device) for device in range(devices)]

@@ -8,9 +8,9 @@ same maximum in every replicate.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import jax
 import numpy as np
@@ -21,9 +21,9 @@ from scipy import stats
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.plausible import is_one_sided, nulls, places, prior_scale, sizes
+from dtprob.gap.fitting.plausible import is_one_sided, nulls, places, prior_scale
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.tails import LOG_SMALLEST, effective_tests, family_wise
+from dtprob.gap.tails import LOG_SMALLEST, any_of, effective_tests, family_wise
 from dtprob.gap.which.directions import surroundings
 
 _MOST_PRODUCTS: Final = 5e10
@@ -34,8 +34,11 @@ _PORTION: Final = 576
 """Places whose scores are told in one run."""
 
 
-type Grid = tuple[Float[np.ndarray, "place parameter"], Float[np.ndarray, "place parameter"]]
-"""Places as flat parameters, and how far apart neighbours are."""
+class _Grid(NamedTuple):
+    """Places as flat parameters, and how far apart neighbours are."""
+
+    points: Float[np.ndarray, "place parameter"]
+    spacing: Float[np.ndarray, "place parameter"]
 
 
 @dataclass(frozen=True)
@@ -62,7 +65,7 @@ def place(problem: Problem, fitted: Fit, drawn: Replicates) -> tuple[Problem, Ma
         drawn: site gradients of the data and of replicates at the fit.
     """
     left = [e for e in problem.effects if e.name not in fitted.effects]
-    searched = [e for e in left if _is_searched(e) and not drawn.gradients.keys().isdisjoint(e.rewrites)]
+    searched = [e for e in left if e.is_looked_for and not drawn.gradients.keys().isdisjoint(e.rewrites)]
     if not searched:
         return problem, {}
     around = surroundings(problem, fitted.x).grown()
@@ -80,7 +83,7 @@ def _best(
     effect: Effect,
     around: Mapping[str, jax.Array],
     drawn: Replicates,
-    grid: Grid,
+    grid: _Grid,
 ) -> tuple[Placed, np.ndarray]:
     """How the best place of an effect was found, and its flat parameters there."""
     one_sided = is_one_sided(effect)
@@ -95,33 +98,40 @@ def _best(
         t = _standardised(np.concatenate(scores)[: len(points)])
         return t if one_sided else np.abs(t)
 
-    points, spacing = grid
-    t = told(points)
-    own, largest = t[:, 0], t.max(axis=0)
-    replicate_p, best = _tail(largest[1:], len(largest) - 2, one_sided=one_sided), points[int(own.argmax())]
-    ways = np.array(list(itertools.product((-1, 0, 1), repeat=points.shape[1])))
-    ways = ways[~ways[:, (spacing == 0).all(axis=0)].any(axis=1)]
-    for kept in _FINER:
-        chosen = np.argsort(-own)[:kept]
-        spacing = spacing[chosen] / 3
-        points = (points[chosen][:, None] + ways * spacing[:, None]).reshape(-1, points.shape[1])
-        spacing, own = np.repeat(spacing, len(ways), axis=0), told(points)[:, 0]
-        if own.max() > largest[0]:
-            best, largest[0] = points[int(own.argmax())], own.max()
+    t = told(grid.points)
+    ways = _ways(grid)
+    best, highest = _finer(grid, t[:, 0], ways, lambda points: told(points)[:, 0])
+    largest = np.array([highest, *t[:, 1:].max(axis=0)])
+    p, replicate_p = np.split(_tail(largest, len(largest) - 2, one_sided=one_sided), [1])
     # What is looked at more finely in the data alone could have been in as many more places.
     several = effective_tests(replicate_p) * len(ways)
-    p = _tail(largest[:1], len(largest) - 2, one_sided=one_sided)[0]
-    chance = float(-np.expm1(several * np.log1p(-min(p, 1 - 1e-16))))
+    chance = float(any_of(p, several)[0])
     return Placed(chance, family_wise(replicate_p, replicate_p), float(np.log(several))), best
 
 
-def _is_searched(effect: Effect) -> bool:
-    """Whether an effect names places at which it is looked for, and has one size to be looked for."""
-    looked = any(p.tried for p in effect.parameters)
-    return looked and effect.kind == "mean" and not effect.distributions and len(sizes(effect)) == 1
+def _ways(grid: _Grid) -> np.ndarray:
+    """Steps (way, parameter) from a place to its neighbours along all parameters that have several, and to itself."""
+    ways = np.array(list(itertools.product((-1, 0, 1), repeat=grid.points.shape[1])))
+    return ways[~ways[:, (grid.spacing == 0).all(axis=0)].any(axis=1)]
 
 
-def _grid(effect: Effect, most: int) -> Grid:
+def _finer(
+    grid: _Grid, scores: np.ndarray, ways: np.ndarray, told: Callable[[np.ndarray], np.ndarray]
+) -> tuple[np.ndarray, float]:
+    """The best place and its score, after finer and finer looks around those with the largest scores of the grid."""
+    (points, spacing), highest = grid, float(scores.max())
+    best = points[int(scores.argmax())]
+    for kept in _FINER:
+        chosen = np.argsort(-scores)[:kept]
+        spacing = spacing[chosen] / 3
+        points = (points[chosen][:, None] + ways * spacing[:, None]).reshape(-1, points.shape[1])
+        spacing, scores = np.repeat(spacing, len(ways), axis=0), told(points)
+        if scores.max() > highest:
+            best, highest = points[int(scores.argmax())], float(scores.max())
+    return best, highest
+
+
+def _grid(effect: Effect, most: int) -> _Grid:
     """Combinations (place, parameter) of the places that are tried, the size at its null, and how far apart they are."""
     values = [np.array(p.tried or (p.null,)) for p in effect.parameters]
     gaps = [np.gradient(v) if len(v) > 1 else np.zeros(1) for v in values]
@@ -129,7 +139,7 @@ def _grid(effect: Effect, most: int) -> Grid:
         np.stack(np.meshgrid(*v, indexing="ij"), -1).reshape(-1, len(v)) for v in (values, gaps)
     )
     kept = np.linspace(0, len(points) - 1, min(max(most, 1), len(points))).round().astype(int)
-    return points[kept], spacing[kept]
+    return _Grid(points[kept], spacing[kept])
 
 
 def _standardised(scores: Float[np.ndarray, "place n"]) -> Float[np.ndarray, "place n"]:

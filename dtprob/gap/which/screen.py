@@ -24,12 +24,7 @@ from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.soundness import UNSEEN
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.tails import (
-    LOG_SMALLEST,
-    family_wise,
-    log_gamma_tail,
-    normal_quantile,
-)
+from dtprob.gap.tails import LOG_SMALLEST, deviation, family_wise, log_gamma_tail, normal_quantile
 from dtprob.gap.which.directions import Tangents, surroundings, tangents
 from dtprob.gap.which.fields import field_tests
 from dtprob.gap.which.pairs import Pair, best_pairs
@@ -101,8 +96,9 @@ def screen(
     (mean_p, mean_z), null_p = _mean_tests(scores, scores.u[None]), _mean_tests(scores, scores.u_null)[0]
     for k, found in ((k, placed[e.name]) for k, e in enumerate(means) if e.name in placed):
         mean_p[0, k], null_p[:, k] = found.p_value, 1.0
-        z = stats.norm.isf(min(found.p_value / (1 if is_one_sided(means[k]) else 2), 1 - 1e-16))
-        mean_z[0, k] = z if is_one_sided(means[k]) else np.copysign(z, mean_z[0, k])
+        one_sided = is_one_sided(means[k])
+        z = deviation(found.p_value, one_sided=one_sided)
+        mean_z[0, k] = z if one_sided else np.copysign(z, mean_z[0, k])
     replicate_p = null_p.min(axis=1, initial=1.0)
     # The replicates of fields and of places are the first of the same data sets.
     for others in (

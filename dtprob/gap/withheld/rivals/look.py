@@ -9,7 +9,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy import stats
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.bootstrap import Replicates, replicate
@@ -18,7 +17,7 @@ from dtprob.gap.fitting.plausible import is_one_sided, sizes
 from dtprob.gap.fitting.projection import Projection, project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.tails import gamma_tail
+from dtprob.gap.tails import deviation, gamma_tail
 from dtprob.gap.which.directions import surroundings, tangents
 from dtprob.gap.which.places import Placed, place
 from dtprob.gap.which.screen import Scores, mean_scores
@@ -113,8 +112,9 @@ def _paid(scores: Scores, u: np.ndarray, placed: Mapping[str, Placed]) -> np.nda
     for effect, group in zip(scores.effects, scores.groups, strict=True):
         if effect.name in placed:
             found, own = placed[effect.name], group[sizes(effect)[0]]
-            p = np.minimum(np.array([found.p_value, *found.replicate_p]), 1 - 1e-16)
-            u[:, own] = stats.norm.isf(p) * np.sqrt(scores.information[own, own])
+            p = np.array([found.p_value, *found.replicate_p])
+            t = deviation(p, one_sided=is_one_sided(effect))
+            u[:, own] = t * np.sqrt(scores.information[own, own])
     return u
 
 
