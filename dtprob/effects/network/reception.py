@@ -8,17 +8,25 @@ from typing import Any, Final
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 from jaxtyping import Array, Float
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
-from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.network.laws import at, mix
 
-_MEMORY: Final = 0.7
-"""Share of what was heard that is still remembered a slot later."""
+_DURATION: Final = Parameter("log_duration", dist.Normal(1.6, 1.0), 1.6, is_place=True)
+"""Logarithm of the number of slots over which bad times are correlated; tells nothing where there are none."""
 
 _LEAST: Final = 1e-12
 """Probability below which the twin holds a number of deliveries impossible."""
+
+_SURE: Final = 1e3
+"""Odds that one slot can give to one state of the channel over the other."""
+
+_FILTER: Final = (
+    "Markov chain of two states, integrated out exactly by its filter (Hamilton, Econometrica 57 (1989) 357)."
+)
 
 type Unheard = Callable[[Any, Mapping[str, Any], int], Float[Array, "episode slot delivery_count"]]
 type Other = Callable[[Any, Mapping[str, Any]], Float[Array, "episode slot delivery_count"]]
@@ -96,23 +104,20 @@ def near_far(sites: Sites, _data: Data) -> list[Effect]:
 
 
 def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
-    """The channel has good and bad times: slots are like those before, or windows differ."""
+    """The channel has good and bad times: nothing is heard in outages that last, or windows differ."""
     if not offers(sites, "reception_logits"):
         return []
 
-    def follow(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        silence = jnp.broadcast_to(at(0, value.shape[-1]).astype(float), value.shape)
-        tilt = p["memory"] * _heard_before(context)[..., None] * np.arange(value.shape[-1])
-        return mix(value, silence, p["loss"]) + tilt
+    def silence(value: Any, _: Mapping[str, Any]) -> Any:
+        return jnp.broadcast_to(at(0, value.shape[-1]).astype(float), value.shape)
 
     effects = [
         Effect(
             "bursty_channel",
-            {"reception_logits": follow},
-            (half_normal("loss", 0.5), normal("memory", 5.0)),
-            physics="Nothing is heard in a share 1 - exp(-loss) of the slots, and more after more than expected was heard.",
-            source="Observation-driven surrogate of the Gilbert-Elliott channel (Davis, Dunsmuir & Streett 2003): "
-            f"P(d) exp(c d m), m[t] = {_MEMORY} m[t-1] + {1 - _MEMORY:.1f} (heard[t-1] - expected).",
+            {"reception_logits": _at_times(silence, "loss")},
+            (half_normal("loss", 0.5), _DURATION),
+            physics="Nothing is heard in a share 1 - exp(-loss) of the slots, in outages of about exp(log_duration) slots.",
+            source="Channel of Gilbert (1960) and Elliott (1963), " + _FILTER,
             requires=("sending", "deliveries", "log_reception"),
         )
     ]
@@ -136,7 +141,7 @@ def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
 
 
 def interferer(sites: Sites, _data: Data) -> list[Effect]:
-    """A transmitter that the log does not know sends too, always or near one device."""
+    """A transmitter that the log does not know sends too, in bouts, or near one device."""
     if not offers(sites, "reception_logits", "device_advantage"):
         return []
     devices = sites["device_advantage"].shape[-1]
@@ -150,17 +155,23 @@ def interferer(sites: Sites, _data: Data) -> list[Effect]:
             law = (more * jnp.maximum(1.0 - share, 0.0) + _next(more * share))[_senders(context)]
             return jnp.where(_with(context, device), law, jax.nn.softmax(value))
 
+        anywhere, activity = device is None, half_normal("activity", 0.5)
+        law = "P_s becomes P_{s+1}; one of its d deliveries is the stranger's with probability d / (s + 1)"
         effects.append(
             Effect(
                 "interferer",
-                {"reception_logits": _mixed(other, "activity")},
-                (half_normal("activity", 0.5),),
-                instance=None if device is None else f"device_{device}",
+                {"reception_logits": (_at_times if anywhere else _mixed)(other, "activity")},
+                (activity, _DURATION) if anywhere else (activity,),
+                instance=None if anywhere else f"device_{device}",
                 physics="In a share 1 - exp(-activity) of the slots"
-                + ("" if device is None else f" in which device {device} sends")
+                + (
+                    ", in bouts of about exp(log_duration) slots,"
+                    if anywhere
+                    else f" in which device {device} sends"
+                )
                 + " one sender more takes part.",
-                source="P_s becomes P_{s+1}; one of its d deliveries is the stranger's with probability d / (s + 1).",
-                requires=("sending", "log_reception"),
+                source=f"{law}; the bouts are a {_FILTER}" if anywhere else f"{law}.",
+                requires=("sending", "log_reception", "deliveries"),
             )
         )
     return effects
@@ -271,6 +282,36 @@ def _mixed(other: Other, parameter: str) -> Callable[[Any, Mapping[str, Any], Ma
     return rewrite
 
 
+def _at_times(other: Other, parameter: str) -> Callable[[Any, Mapping[str, Any], Mapping[str, Any]], Any]:
+    """Another law in bad times, which come and go as a Markov chain of two states does."""
+
+    def rewrite(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        law, delivered = other(value, context), jnp.asarray(context["deliveries"])[..., None]
+        good, bad = (jnp.take_along_axis(q, delivered, axis=-1)[..., 0] for q in (jax.nn.softmax(value), law))
+        odds = jnp.minimum(bad / jnp.maximum(good, _LEAST), _SURE)
+        chance = _bad_times(odds, -jnp.expm1(-p[parameter]), jnp.exp(-jnp.exp(-p["log_duration"])))
+        return mix(value, law, -jnp.log1p(-chance)[..., None])
+
+    return rewrite
+
+
+def _bad_times(odds: Float[Array, "episode slot"], share: Any, memory: Any) -> Float[Array, "episode slot"]:
+    """Chance of bad times in each slot, given the slots before it.
+
+    Args:
+        odds: what each slot says, its probability in bad times over that in good ones.
+        share: of bad times on average.
+        memory: correlation of neighbouring slots.
+    """
+
+    def pass_on(chance: Array, odds: Array) -> tuple[Array, Array]:
+        after = chance * odds / (1.0 + chance * (odds - 1.0))
+        return share + memory * (after - share), chance
+
+    first = jnp.broadcast_to(jnp.asarray(share, odds.dtype), odds.shape[:1])
+    return jax.lax.scan(pass_on, first, odds.T)[1].T
+
+
 def _senders(context: Mapping[str, Any]) -> Array:
     """How many devices send, (episode, slot)."""
     return jnp.sum(jnp.asarray(context["sending"]), axis=-1)
@@ -285,18 +326,6 @@ def _with(context: Mapping[str, Any], device: int | None) -> Array:
 def _next(mass: Float[Array, "*batch delivery_count"]) -> Float[Array, "*batch delivery_count"]:
     """Mass moved to one delivery fewer; that of none is gone."""
     return jnp.concatenate([mass[..., 1:], jnp.zeros_like(mass[..., :1])], axis=-1)
-
-
-def _heard_before(context: Mapping[str, Any]) -> Float[Array, "episode slot"]:
-    """How many more slots with senders than expected were heard, as a fading mean over the slots before; 0 at first."""
-    senders = _senders(context)
-    expected = 1.0 - jnp.exp(context["log_reception"][:, 0])[senders]
-    more = jnp.where(senders > 0, (jnp.asarray(context["deliveries"]) > 0) - expected, 0.0)
-
-    def pass_on(mean: Array, new: Array) -> tuple[Array, Array]:
-        return _MEMORY * mean + (1 - _MEMORY) * new, mean
-
-    return jax.lax.scan(pass_on, jnp.zeros_like(more[:, 0]), more.T)[1].T
 
 
 FAMILIES: Final[dict[str, Family]] = {

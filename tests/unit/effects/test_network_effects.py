@@ -171,23 +171,46 @@ def test_what_cannot_happen_still_cannot_when_a_device_changes():
     assert np.isneginf(tilted(logits, 1, jnp.array(0.7))[3])
 
 
-def test_outages_come_after_outages(offered, data):
-    senders = np.asarray(data["sending"]).sum(-1)
+def with_a_stranger(table):
+    """Law of the known deliveries where a stranger sends too, for each number of known senders but the largest."""
+    size, wider = len(table), np.zeros_like(table)
+    for senders in range(1, size - 1):
+        law = table[senders + 1]
+        for delivered in range(senders + 2):
+            strangers = delivered / (senders + 1)
+            wider[senders, delivered] += law[delivered] * (1 - strangers)
+            if delivered:
+                wider[senders, delivered - 1] += law[delivered] * strangers
+    wider[0, 0] = 1.0
+    return wider
+
+
+@pytest.mark.parametrize(("name", "parameter"), [("bursty_channel", "loss"), ("interferer", "activity")])
+def test_bad_times_by_enumeration_of_all_of_them(offered, data, name, parameter):
+    """The likelihood of six slots, summed over all 64 sequences of good and bad ones, is the product of the laws."""
+    share, duration, length = 0.3, 4.0, 6
+    amounts = {parameter: -jnp.log1p(-share), "log_duration": jnp.log(duration)}
+    laws = law(data, offered[name], site="reception_logits", **amounts)
+    senders, delivered = np.asarray(data["sending"]).sum(-1), np.asarray(data["deliveries"])
     table = np.exp(np.asarray(TABLES["log_reception"]))
-    mean = np.zeros(senders.shape)
-    for window, slot in np.ndindex(*senders.shape):
-        if slot:
-            n = senders[window, slot - 1]
-            heard = float(data["deliveries"][window, slot - 1] > 0)
-            new = heard - (1 - table[n, 0]) if n else 0.0
-            mean[window, slot] = 0.7 * mean[window, slot - 1] + 0.3 * new
-    lost = law(
-        data, offered["bursty_channel"], site="reception_logits", loss=jnp.log(2.0), memory=jnp.array(3.0)
-    )
-    wanted = 0.5 * table[senders] + 0.5 * (np.arange(5) == 0)
-    wanted = wanted * np.exp(3.0 * mean[..., None] * np.arange(5))
-    np.testing.assert_allclose(lost, wanted / wanted.sum(-1, keepdims=True), rtol=1e-4, atol=1e-6)
-    assert np.ptp(mean) > 0.2
+    bad = np.eye(5)[np.zeros(5, int)] if name == "bursty_channel" else with_a_stranger(table)
+    memory, told = np.exp(-1 / duration), 0
+    for window in range(len(senders)):
+        own, heard = senders[window, :length], delivered[window, :length]
+        if own.max() + (name == "interferer") >= len(table):
+            continue
+        total = 0.0
+        for states in itertools.product((0, 1), repeat=length):
+            p = 1.0
+            for t, state in enumerate(states):
+                to_bad = share if t == 0 else share + memory * (states[t - 1] - share)
+                p *= to_bad if state else 1 - to_bad
+                p *= (bad if state else table)[own[t], heard[t]]
+            total += p
+        product = np.prod([laws[window, t, heard[t]] for t in range(length)])
+        np.testing.assert_allclose(product, total, rtol=1e-4)
+        told += 1
+    assert told > 0
 
 
 @pytest.mark.parametrize(
@@ -200,7 +223,8 @@ def test_mixtures_of_receptions_stay_laws(offered, data, name, amount):
     logits = trace_model(multi_access, data, jax.random.key(0), TABLES)
     value = logits["reception_logits"]["value"]
     context = {**data, "log_reception": TABLES["log_reception"]}
-    changed = effect.rewrites["reception_logits"](value, {parameter: jnp.array(amount)}, context)
+    given = {**{p.name: jnp.asarray(p.null) for p in effect.parameters}, parameter: jnp.array(amount)}
+    changed = effect.rewrites["reception_logits"](value, given, context)
     mass = np.asarray(jnp.exp(changed - jax.nn.logsumexp(value, axis=-1, keepdims=True)).sum(axis=-1))
     np.testing.assert_allclose(mass, 1.0, atol=1e-6)
     after = np.asarray(jax.nn.softmax(changed))
@@ -215,9 +239,8 @@ def test_a_stranger_takes_its_share_of_the_deliveries(offered, data):
     senders = np.asarray(data["sending"]).sum(axis=-1)
     value = trace_model(multi_access, data, jax.random.key(0), TABLES)["reception_logits"]["value"]
     context = {**data, "log_reception": TABLES["log_reception"]}
-    changed = offered["interferer"].rewrites["reception_logits"](
-        value, {"activity": jnp.array(60.0)}, context
-    )
+    always = {"activity": jnp.array(60.0), "log_duration": jnp.array(1.6)}
+    changed = offered["interferer"].rewrites["reception_logits"](value, always, context)
     alone = np.asarray(jax.nn.softmax(changed))[senders == 1]
     np.testing.assert_allclose(alone[0], [0.2 + 0.25, 0.25 + 0.3, 0, 0, 0], atol=1e-6)
 
