@@ -9,6 +9,7 @@ from numpyro import handlers
 from scipy import constants, integrate
 
 from dtprob.effects import Rewriting, catalogue
+from dtprob.raytracing.paths import DIFFRACTION, DIFFUSE, SPECULAR
 
 
 @pytest.fixture(scope="module")
@@ -111,6 +112,42 @@ def test_behind_a_wall_a_pole_takes_nothing_away(shaded):
     np.testing.assert_allclose(found[mask], 1.0, atol=2e-2)
     near, _ = shaded(width=0.05, azimuth=0.3, distance=1.0)
     assert np.abs(near[mask] - 1).max() > 0.02
+
+
+def test_beyond_the_wall_that_turns_a_path_aside_no_pole_is_in_its_way(world, shaded):
+    paths = world.data["paths"]
+    turned = np.isin(np.asarray(paths.interaction), (SPECULAR, DIFFUSE, DIFFRACTION))
+    upright = turned & (np.abs(np.asarray(paths.normal)[..., 2]) < 0.9)
+    departure, length = np.asarray(paths.departure), np.asarray(paths.length)
+    seen = 0
+    for link, path in np.argwhere(upright[..., 0] & np.asarray(paths.mask)):
+        start, wall = np.asarray(paths.tx_position)[link, :2], np.asarray(paths.vertex)[link, path, 0, :2]
+        leg, level = np.linalg.norm(wall - start), np.hypot(*departure[link, path, :2])
+        if not 1.5 * leg < 0.9 * level * length[link, path]:
+            continue
+        azimuth = float(np.arctan2(departure[link, path, 1], departure[link, path, 0]))
+        beyond, before = (
+            shaded(width=20.0, azimuth=azimuth, distance=d)[0][link, path] for d in (1.5 * leg, 0.5 * leg)
+        )
+        assert abs(beyond - 1) < 0.1
+        assert abs(before) < 0.1
+        seen += 1
+    assert seen > 0
+
+
+def test_a_pole_stands_before_its_own_transmitter_alone(world):
+    paths = world.data["paths"]
+    elsewhere = np.arange(paths.n_link) == paths.n_link - 1
+    places = np.asarray(paths.tx_position) + 100.0 * elsewhere[:, None]
+    data = {**world.data, "paths": eqx.tree_at(lambda p: p.tx_position, paths, places)}
+    (pole,) = (
+        e for e in catalogue(world.sites, data) if "pole" in e.name
+    )  # one link's own transmitter has none
+    gain = jnp.ones(np.asarray(paths.delay).shape, complex)
+    wide = {**pole.null(), "width": jnp.array(5.0)}
+    change = np.abs(np.asarray(pole.rewrites["path_gain"](gain, wide, data)) - 1)
+    assert not change[elsewhere].any()
+    assert change[~elsewhere].max() > 0.02
 
 
 def test_a_wide_pole_takes_all_of_what_it_stands_before(world, shaded):

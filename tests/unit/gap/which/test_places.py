@@ -54,13 +54,19 @@ def test_scores_at_places_are_derivatives_in_the_size(looked):
     np.testing.assert_allclose(told, by_hand, rtol=1e-4, atol=1e-4 * np.abs(by_hand).max())
 
 
-@pytest.mark.parametrize("at", [-0.93, 0.41])
-def test_the_best_place_is_found_between_those_that_are_tried(looked, at):
-    shift = raised(inputs(), at, 2.5)
+@pytest.mark.parametrize(("at", "size"), [(-0.93, 2.5), (0.41, -2.5)])
+def test_the_best_place_is_found_between_those_that_are_tried(looked, at, size):
+    shift = raised(inputs(), at, size)
     problem, base, projection, drawn = looked(shift)
     placed, found = place(problem, base, drawn)
     moved = next(e for e in placed.effects if e.name == "bump").parameters[1]
     assert abs(moved.null - at) < 0.5 * WIDTH
+    fine = np.arange(-1.5, 1.5, (PLACES[1] - PLACES[0]) / 9)
+    points = np.stack([np.zeros_like(fine), fine], axis=1)
+    around = surroundings(problem, base.x).grown()
+    scores = problem.programs.place_scores("bump", around, drawn.gradients, points)
+    largest = np.abs(scores[:, 0] / scores[:, 1:].std(axis=1)).argmax()
+    assert abs(moved.null - fine[largest]) < 1.1 * (fine[1] - fine[0])
     assert float(moved.prior.mean) == moved.null
     assert found["bump"].p_value < 1e-4
     assert 1 < np.exp(found["bump"].price) < 9 * len(PLACES)
@@ -119,6 +125,9 @@ def test_what_is_not_there_has_a_negative_score(looked):
     seen = screen(placed, base, projection, drawn, Settings(), placed=found)
     z = seen.z[seen.names.index("bump")]
     np.testing.assert_allclose(stats.norm.sf(z), found["bump"].p_value, rtol=1e-6)
+    np.testing.assert_allclose(seen.p_value[seen.names.index("bump")], found["bump"].p_value)
+    np.testing.assert_array_equal(seen.replicate_p, found["bump"].replicate_p)  # there is no other effect
+    assert (found["bump"].replicate_p < 0.1).sum() <= stats.binom.isf(1e-3, len(seen.replicate_p), 0.1)
     alone = replace(seen.scores, price=np.zeros(1))
     np.testing.assert_allclose(
         alone.log_bayes_factor - seen.scores.log_bayes_factor, found["bump"].price, rtol=1e-9
