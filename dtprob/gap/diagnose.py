@@ -23,6 +23,7 @@ from dtprob.gap.how_far.terms import error_db
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
+from dtprob.gap.which.classes import credible
 from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.search import search
 from dtprob.gap.which.trials import Say, credit
@@ -149,16 +150,8 @@ def _causes(
 def alternatives(evidence: Evidence, settings: Settings) -> tuple[tuple[tuple[str, ...], ...], float]:
     """Sets that differ from the accepted one in one effect and that the data cannot rule out; its probability."""
     found = evidence.explanations
-    names = list(found)
-    worth = np.array([credit(evidence.problem, found[n].fitted, evidence.base) for n in names])
-    weights = np.exp(worth - worth.max())
-    weights /= weights.sum()
-    order = np.argsort(-weights)
-    held = np.cumsum(weights[order])
-    count = int(np.searchsorted(held, settings.credibility)) + 1
-    classes = tuple(names[int(i)] for i in order[:count])
-    own = next(i for i, n in enumerate(names) if set(n) == set(evidence.accepted))
-    return classes, float(weights[own])
+    worth = {names: credit(evidence.problem, one.fitted, evidence.base) for names, one in found.items()}
+    return credible(worth, evidence.accepted, settings.credibility)
 
 
 def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) -> str:

@@ -1,0 +1,37 @@
+"""Which sets of effects the data cannot rule out, from what each is worth."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+type Names = tuple[str, ...]
+
+
+def credible(
+    worth: Mapping[Names, float], accepted: Names, credibility: float
+) -> tuple[tuple[Names, ...], float]:
+    """The sets that hold so much probability together, the likeliest first, and the probability of the accepted one.
+
+    A set that has a better one inside it is no other explanation: what it adds is not needed. Its probability counts for
+    the better one, whose effects are causes in both.
+
+    Args:
+        worth: log evidence of each set, less what it has to be better by.
+        accepted: one of them.
+        credibility: probability that the sets must hold.
+    """
+    order = sorted(worth, key=lambda names: (-worth[names], set(names) != set(accepted)))
+    highest = worth[order[0]]
+    weight: dict[Names, float] = {}
+    for names in order:
+        better = (one for one in weight if set(one) < set(names) and set(names) != set(accepted))
+        counted = next(better, names)
+        weight[counted] = weight.get(counted, 0.0) + float(np.exp(worth[names] - highest))
+    total = sum(weight.values())
+    likeliest = sorted(weight, key=lambda names: -weight[names])
+    held = np.cumsum([weight[names] for names in likeliest]) / total
+    count = int(np.searchsorted(held, credibility)) + 1
+    probability = next(w for names, w in weight.items() if set(names) == set(accepted)) / total
+    return tuple(likeliest[:count]), probability
