@@ -83,7 +83,8 @@ _LATE: Final = 0.5 * (1 + np.tanh((_SHARE - 0.5) / 0.02))
 
 def _handover(rng: np.random.Generator, _runs: Runs) -> Fault:
     """Half-way another station takes over, whose power is not the first one's."""
-    return Fault("handover", None, "dB", _LARGEST_DB, shifted(rng.choice([-1, 1]) * _all(_LATE)))
+    after = 1.0 * (np.arange(STEPS) >= STEPS // 2)
+    return Fault("handover", None, "dB", _LARGEST_DB, shifted(rng.choice([-1, 1]) * _all(after)))
 
 
 def _gain_drift(rng: np.random.Generator, _runs: Runs) -> Fault:

@@ -129,7 +129,7 @@ PARAMETERS: Final[Mapping[str, Mapping[str, Sizes]]] = {
     },
     "network": {"arrival_rate_shift": lambda share: (-float(np.log1p(-share)),)},
     "labels": {"scale_bias": lambda slope: (float(np.log1p(slope)), float(np.log1p(-slope)))},
-    "custom": {"wall": _as_is, "handover": _either},
+    "custom": {"handover": _either},
 }
 """Families whose size means the same in truth and library: the values that the library's first parameter can then have.
 

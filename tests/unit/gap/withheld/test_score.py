@@ -134,13 +134,14 @@ def true(name, size=1.0, information=100.0):
 
 
 def test_sizes_are_compared_where_truth_and_library_speak_of_the_same():
-    wall = [true("wall[river]", 7.6)]
-    assert answered("custom", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == [True]
-    assert answered("custom", wall, named=["wall[river]"], size=(8.0, 9.0)).covered_size() == [False]
-    assert answered("custom", wall, named=["wall[railway]"], size=(7.0, 8.0)).covered_size() == []
-    assert answered("network", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == []
     jump = [true("handover", 3.0)]  # the key does not tell the sign
+    assert answered("custom", jump, named=["handover"], size=(2.5, 3.5)).covered_size() == [True]
     assert answered("custom", jump, named=["handover"], size=(-3.5, -2.5)).covered_size() == [True]
+    assert answered("custom", jump, named=["handover"], size=(3.5, 4.5)).covered_size() == [False]
+    assert answered("custom", jump, named=["gain_drift"], size=(2.5, 3.5)).covered_size() == []
+    assert answered("network", jump, named=["handover"], size=(2.5, 3.5)).covered_size() == []
+    wall = [true("wall[river]", 7.6)]  # whose shadow has a soft edge in truth
+    assert answered("custom", wall, named=["wall[river]"], size=(7.0, 8.0)).covered_size() == []
     gain = [true("gain_offset", 20 * 0.1 / 2.302585093)]  # decibels in truth, nepers in the library
     assert answered("channel", gain, named=["gain_offset"], size=(0.0999, 0.1001)).covered_size() == [True]
 
