@@ -15,8 +15,11 @@ from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offe
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.network.laws import at, mix
 
-_DURATION: Final = Parameter("log_duration", dist.Normal(1.6, 1.0), 1.6, is_place=True)
-"""Logarithm of the number of slots over which bad times are correlated; tells nothing where there are none."""
+_DURATION: Final = Parameter("log_duration", dist.Normal(1.6, 1.0), -1.0, is_place=True)
+"""Logarithm of the number of slots over which bad times are correlated; tells nothing where there are none.
+
+Looked for from nearly no memory: the derivative in a share of bad times of nearly 0 grows without limit in long silences.
+"""
 
 _LEAST: Final = 1e-12
 """Probability below which the twin holds a number of deliveries impossible."""
