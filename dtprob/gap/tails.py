@@ -39,7 +39,7 @@ def effective_tests(replicate_p: np.ndarray) -> float:
 def deviation(p: ArrayLike, *, one_sided: bool) -> np.ndarray:
     """Standard deviations from 0 at which a normal score has a p-value; at least 0 if it is two-sided."""
     tail = np.asarray(p) / (1 if one_sided else 2)
-    return -special.ndtri(np.minimum(tail, 1 - 1e-16))
+    return normal_quantile(np.log(np.minimum(tail, 1 - 1e-16)))
 
 
 def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

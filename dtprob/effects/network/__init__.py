@@ -3,6 +3,11 @@
 from typing import Final
 
 from dtprob.effects.common import Family
-from dtprob.effects.network import arrivals, reception
+from dtprob.effects.network import arrivals, bad_times, reception, unheard
 
-FAMILIES: Final[dict[str, Family]] = {**arrivals.FAMILIES, **reception.FAMILIES}
+FAMILIES: Final[dict[str, Family]] = {
+    **arrivals.FAMILIES,
+    **reception.FAMILIES,
+    **bad_times.FAMILIES,
+    **unheard.FAMILIES,
+}

@@ -22,16 +22,15 @@ def credible(
         accepted: one of them.
         credibility: probability that the sets must hold.
     """
-    order = sorted(worth, key=lambda names: (-worth[names], set(names) != set(accepted)))
-    highest = worth[order[0]]
+    own = next(names for names in worth if set(names) == set(accepted))
+    highest = max(worth.values())
     weight: dict[Names, float] = {}
-    for names in order:
-        better = (one for one in weight if set(one) < set(names) and set(names) != set(accepted))
+    for names in sorted(worth, key=lambda names: (-worth[names], names != own)):
+        better = (one for one in weight if set(one) < set(names) and names != own)
         counted = next(better, names)
         weight[counted] = weight.get(counted, 0.0) + float(np.exp(worth[names] - highest))
     total = sum(weight.values())
     likeliest = sorted(weight, key=lambda names: -weight[names])
     held = np.cumsum([weight[names] for names in likeliest]) / total
     count = int(np.searchsorted(held, credibility)) + 1
-    probability = next(w for names, w in weight.items() if set(names) == set(accepted)) / total
-    return tuple(likeliest[:count]), probability
+    return tuple(likeliest[:count]), weight[own] / total
