@@ -122,9 +122,8 @@ class Site:
     rows: tuple[int, ...] | None = None
 
     def entries(self, kind: str) -> np.ndarray:
-        """Scores (n, *site, part) of a perturbation of every entry."""
-        entry = self.gradients * self.kinds[kind]
-        return np.stack([np.real(entry), np.imag(entry)], -1) if np.iscomplexobj(entry) else entry[..., None]
+        """Scores (n, *site) of a perturbation of every entry; of its parts where it is complex."""
+        return self.gradients * self.kinds[kind]
 
 
 def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients: np.ndarray) -> Site:
@@ -187,19 +186,24 @@ def families(along: Along, over: Over, site: Site) -> Iterator[tuple[Family, np.
     patterns = list({(p.label, p.kept): p for p in _patterns(along, over, site)}.values())
     for kind, factor in site.kinds.items():
         sums = _summed(site.entries(kind), {pattern.kept for pattern in patterns})
-        summed = {kept: Summed(values) for kept, values in sums.items()}
+        summed = {kept: Summed(_parts(values)) for kept, values in sums.items()}
         for pattern in patterns:
             yield Family(kind, pattern, factor), pattern.scores(summed[pattern.kept])
 
 
 def _summed(entries: np.ndarray, wanted: Collection[tuple[int, ...]]) -> dict[tuple[int, ...], np.ndarray]:
-    """Entries (n, *site, part) summed over the axes that are not kept, each sum taken from the smallest that holds it."""
-    summed = {tuple(range(entries.ndim - 2)): entries}
+    """Entries (n, *site) summed over the axes that are not kept, each sum taken from the smallest that holds it."""
+    summed = {tuple(range(entries.ndim - 1)): entries}
     for kept in sorted(wanted, key=lambda kept: -len(kept)):
         around = min((k for k in summed if set(kept) <= set(k)), key=lambda k: summed[k].size)
-        gone = tuple(1 + place for place, axis in enumerate(around) if axis not in kept)
-        summed[kept] = summed[around].sum(axis=gone)
+        summed[kept] = np.einsum(summed[around], [entries.ndim, *around], [entries.ndim, *kept])
     return summed
+
+
+def _parts(values: np.ndarray) -> np.ndarray:
+    """Real and imaginary part along a new last axis, of size 1 for what is real."""
+    parts, kind = (2, complex) if np.iscomplexobj(values) else (1, float)
+    return np.ascontiguousarray(values, kind).view(float).reshape(*values.shape, parts)
 
 
 def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:

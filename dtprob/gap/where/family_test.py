@@ -5,14 +5,17 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from dtprob.gap.tails import variance_ratio_tail
 from dtprob.gap.where.families import Family
 
 CHANCE: Final = 8
 """Replicates that tell what a site would gain by chance."""
-_ALONE: Final = 1 - 1e-9
-"""Share of an entry's variance above which one replicate is all there is of it: rare outcomes move no other."""
+_OTHERS: Final = 1e-9
+"""Share of an entry's variance below which the other replicates tell nothing of it: rare outcomes move but one."""
+_AT_ONCE: Final = 1 << 17
+"""Scores that are looked at together, so that they stay in the processor's cache."""
 
 
 class FamilyTest(NamedTuple):
@@ -36,20 +39,33 @@ class FamilyTest(NamedTuple):
 def family_test(family: Family, scores: np.ndarray) -> FamilyTest:
     """Test a family's summed squared scores (1 + replicate, entry), each entry scaled by its null variance."""
     first, n = scores[: 1 + CHANCE].copy(), len(scores) - 1
-    share = scores[1:] ** 2
-    total = share.sum(0)
-    variance = total / n
+    total = np.einsum("ne,ne->e", scores[1:], scores[1:])
     alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
     if not alive.any():
-        return FamilyTest(family, 1.0, np.ones(n), first, variance)
-    given = scores[0]
-    if not alive.all():
-        share, given, total = share[:, alive], given[alive], total[alive]
-    share /= total
-    share[share > _ALONE] = 0.0
-    statistic = (n - 1) * (share / (1.0 - share)).sum(1)  # each replicate scaled by the others
-    value = float((given**2 / (total / n)).sum())
+        return FamilyTest(family, 1.0, np.ones(n), first, total / n)
+    statistic = (n - 1) * _against_the_others(scores[1:], np.where(alive, total, np.inf))
+    value = n * float((scores[0, alive] ** 2 / total[alive]).sum())
     p = variance_ratio_tail(
         np.append(statistic, value), float(statistic.mean()), float(statistic.var()), n - 1
     )
-    return FamilyTest(family, float(p[-1]), p[:-1], first, variance)
+    return FamilyTest(family, float(p[-1]), p[:-1], first, total / n)
+
+
+def _against_the_others(
+    scores: Float[np.ndarray, "replicate entry"], total: Float[np.ndarray, " entry"]
+) -> Float[np.ndarray, " replicate"]:
+    """Each replicate's squared scores over the sum of the others', summed over the entries a few at a time.
+
+    Args:
+        scores: of the replicates.
+        total: sum of their squares, infinite where an entry does not count.
+    """
+    found, width = np.zeros(len(scores)), max(_AT_ONCE // len(scores), 1)
+    for start in range(0, len(total), width):
+        own = scores[:, start : start + width] ** 2
+        others = total[start : start + width] - own
+        alone = others < _OTHERS * total[start : start + width]
+        if alone.any():
+            own[alone], others[alone] = 0.0, 1.0
+        found += (own / others).sum(1)
+    return found
