@@ -168,11 +168,18 @@ class Answer:
 
     @property
     def is_resolvable(self) -> bool:
-        """Whether each true effect can be told from every other candidate, as far as the report tells."""
-        alike = self._alike
-        known = [e for e in self.truth["effects"] if alike is not None and e["name"] in alike[0]]
-        return alike is not None and all(
-            is_resolvable(alike[1], alike[0].index(e["name"]), float(e.get("lambda") or 0.0)) for e in known
+        """Whether each true effect can be told from every other candidate beside the others, as far as the report tells."""
+        if self._alike is None:
+            return False
+        names, correlation = self._alike
+        known = {
+            names.index(e["name"]): float(e.get("lambda") or 0.0)
+            for e in self.truth["effects"]
+            if e["name"] in names
+        }
+        return all(
+            is_resolvable(correlation, own, lambda_, [k for k in known if k != own])
+            for own, lambda_ in known.items()
         )
 
     @property

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ _LEVEL: Final = 0.01
 _CREDIBILITY: Final = 0.9
 _ERROR: Final = 0.02
 """Chance of taking one effect for the other at which two count as resolvable."""
+_ROUNDED: Final = 0.01
+"""To what the correlations of a report are rounded."""
 
 
 class Limit(NamedTuple):
@@ -56,10 +59,25 @@ def limit(correlation: Float[np.ndarray, "effect effect"], true: int, lambda_: f
     )
 
 
-def is_resolvable(correlation: Float[np.ndarray, "effect effect"], true: int, lambda_: float) -> bool:
-    """Whether an effect can be told from every other candidate with an error of 2%: lambda (1 - |rho|) / 2 >= z^2."""
-    others = np.delete(np.abs(correlation[true]), true)
-    return bool(lambda_ * (1 - others.max(initial=0.0)) / 2 >= stats.norm.isf(_ERROR) ** 2)
+def is_resolvable(
+    correlation: Float[np.ndarray, "effect effect"], true: int, lambda_: float, beside: Sequence[int] = ()
+) -> bool:
+    """Whether an effect can be told from every other candidate with an error of 2%: lambda (1 - |rho|) / 2 >= z^2.
+
+    Args:
+        correlation: of the candidates' scores.
+        true: position of the effect.
+        lambda_: its noncentrality, alone.
+        beside: positions of true effects beside it: lambda and rho are what these leave of them.
+    """
+    others, kept = list(beside), [true, *(k for k in range(len(correlation)) if k not in {true, *beside})]
+    explained = correlation[np.ix_(kept, others)]
+    among = correlation[np.ix_(others, others)] + _ROUNDED * np.eye(len(others))
+    left = correlation[np.ix_(kept, kept)] - explained @ np.linalg.solve(among, explained.T)
+    alone = np.maximum(np.diag(left), _ROUNDED)
+    alike = np.abs(left[0, 1:]) / np.sqrt(alone[0] * alone[1:])
+    told = lambda_ * alone[0] * (1 - min(float(alike.max(initial=0.0)), 1.0)) / 2
+    return bool(told >= stats.norm.isf(_ERROR) ** 2)
 
 
 def correlation_matrix(percent: list[list[int]]) -> Float[np.ndarray, "effect effect"]:

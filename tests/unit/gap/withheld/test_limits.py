@@ -43,6 +43,18 @@ def test_what_can_be_resolved(rho, needed):
     assert not is_resolvable(matrix, 0, 0.98 * needed)
 
 
+def test_what_can_be_resolved_beside_another_true_effect():
+    """A candidate that is the sum of two true effects is like each by half, and beside one all of the other."""
+    half = np.sqrt(0.5)
+    matrix = np.array([[1.0, 0.0, half], [0.0, 1.0, half], [half, half, 1.0]])
+    assert is_resolvable(matrix, 0, 1000.0)
+    assert not is_resolvable(matrix, 0, 1000.0, beside=[1])
+    alike = np.array([[1.0, 0.6, 0.0], [0.6, 1.0, 0.0], [0.0, 0.0, 1.0]])
+    needed = 2 * stats.norm.isf(0.02) ** 2 / (1 - 0.6**2)  # what the other leaves, against one unlike both
+    assert is_resolvable(alike, 0, 1.02 * needed, beside=[1])
+    assert not is_resolvable(alike, 0, 0.98 * needed, beside=[1])
+
+
 def test_a_matrix_is_read_from_its_rows():
     np.testing.assert_allclose(
         correlation_matrix([[], [50], [-10, 0]]), [[1, 0.5, -0.1], [0.5, 1, 0], [-0.1, 0, 1]]
