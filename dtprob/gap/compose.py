@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
 
@@ -89,12 +89,21 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
         case _:
             if best is None:
                 return "There are signs of a gap, but the data cannot tell which effect causes it."
-            classes = " or ".join(" and ".join(c) for c in best.alias_class)
-            return (
-                f"There is a gap, but the data cannot tell {classes} apart."
-                if len(best.alias_class) > 1
-                else (f"There are signs of {name}, but held-out data do not confirm that it closes a gap.")
-            )
+            return _undecided(best.alias_class)
+
+
+def _undecided(sets: Sequence[Sequence[str]]) -> str:
+    """What the explanations have in common, if anything, and what cannot be told apart."""
+    if len(sets) == 1:
+        return f"There are signs of {' and '.join(sets[0])}, but held-out data do not confirm that it closes a gap."
+    common = [name for name in sets[0] if all(name in names for names in sets)]
+    rests = [" and ".join(name for name in names if name not in common) for names in sets]
+    if not common:
+        return f"There is a gap, but the data cannot tell {' or '.join(rests)} apart."
+    sure, choice = " and ".join(common), " or ".join(rest for rest in rests if rest)
+    if "" in rests:
+        return f"The gap comes from {sure}, perhaps together with {choice}: the data cannot tell."
+    return f"The gap comes from {sure} together with {choice}, and the data cannot tell which."
 
 
 def _place(found: SiteFinding) -> str:

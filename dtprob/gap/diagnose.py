@@ -132,7 +132,7 @@ def _causes(
     classes, probability = alternatives(evidence, settings)
     first = evidence.held_after.estimates
     strata = tuple(float(v) for v in next(iter(first.values()))[:, 0]) if first else ()
-    physics = "; ".join(e.physics for e in effects if e.physics)
+    physics = " ".join(e.physics for e in effects if e.physics)
     cause = Cause(
         effects=evidence.accepted,
         alias_class=classes,

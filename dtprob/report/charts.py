@@ -14,6 +14,7 @@ from dtprob.report.figures import (
     gap_track,
     interval_plot,
     plan_view,
+    usual_limit,
 )
 from dtprob.report.json_schema import Interval, Report
 from dtprob.report.names import capital, listing, together, words
@@ -47,8 +48,8 @@ def gap_chart(report: Report) -> Chart | None:
         told.append(f"Best possible: between {number(floor[0])} and {number(floor[1])}.")
     figure = gap_track(gap["before"], gap["after"], floor, unit=gap["unit"])
     caption = (
-        "Shorter bars are better; the best possible ends somewhere in the lowest bar. With a loss of 0.1 nats per "
-        "observation more, a twin finds what was measured about 10% less likely at each observation."
+        "Shorter bars are better; the best that any model could reach lies somewhere on the lowest line. With a loss "
+        "of 0.1 nats per observation more, a twin finds what was measured about 10% less likely at each observation."
     )
     return Chart(
         inline_svg(figure, " ".join(told)), caption if floor is not None else "Further left is better."
@@ -101,7 +102,8 @@ def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     named = [axis for entry in report["where"]["coordinates"] for axis in entry["axes"]]
     axes = [name[len(_BEFORE) :] for name in map(str, data) if _is_before(name) and data[name].count() > 1]
     ordered = sorted(axes, key=lambda axis: named.index(axis) if axis in named else len(named))
-    return [_coordinate_chart(data, axis) for axis in ordered[:_MOST_MAPS]]
+    quiet = report["verdict"] == "NO_GAP"
+    return [_coordinate_chart(data, axis, quiet=quiet) for axis in ordered[:_MOST_MAPS]]
 
 
 def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
@@ -180,17 +182,17 @@ def _group(gap: xr.DataTree | None, name: str, report: Report) -> xr.Dataset:
     return dataset[kept].where(np.abs(dataset[kept]) < np.inf)
 
 
-def _coordinate_chart(data: xr.Dataset, axis: str) -> Chart:
+def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool) -> Chart:
     complete = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]].dropna(axis)
     before, after = complete[_BEFORE + axis], complete.get(_AFTER + axis)
     place, unit = _places(before, axis)
-    name = capital(words(axis))
+    name, limit = capital(words(axis)), before.attrs.get("threshold") or usual_limit(before.size)
     figure = coordinate_map(
         place,
         before.values,
         None if after is None else after.values,
         label=f"{name} ({unit})" if unit else name,
-        threshold=before.attrs.get("threshold"),
+        threshold=limit,
     )
     told = f"Gap over {words(axis)}: {_peak(before.values, place, 'before')}"
     if after is not None:
@@ -199,6 +201,13 @@ def _coordinate_chart(data: xr.Dataset, axis: str) -> Chart:
         f"{name}: how much more the data stray from the twin than they should. "
         "Grey: where all values stay, in 95 of 100 cases, when the twin is right."
     )
+    unseen = data.sizes[axis] - complete.sizes[axis]
+    if unseen:
+        caption += f" {unseen} not shown: nothing was observed there."
+    if bool((np.abs(before) > limit).any()):
+        caption += " One such figure in twenty has a value outside by chance." * quiet
+    elif not quiet:
+        caption += f" No {words(axis)} stands out alone: the gap is a pattern across them."
     return Chart(inline_svg(figure, f"{told}."), caption)
 
 

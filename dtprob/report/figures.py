@@ -137,11 +137,16 @@ def gap_track(before: float, after: float | None, floor: tuple[float, float] | N
                 axes.barh(place, value - floor[0], left=floor[0], height=0.26, color=colour)
             _beside(axes, value, place, number(value, decimals))
         if floor is not None:
-            axes.barh(len(rows), floor[1] - floor[0], left=floor[0], height=0.26, color=LIGHT["muted"])
+            axes.plot(floor, [len(rows)] * 2, "|-", color=LIGHT["muted"], markersize=12, linewidth=1.3)
             _beside(axes, floor[1], len(rows), " to ".join(number(end, decimals) for end in floor))
         axes.margins(x=0.2)
         axes.set_xlabel(f"Loss on held-out data ({unit})")
         return figure
+
+
+def usual_limit(count: int) -> float:
+    """Within which all of so many independent normal values stay in 95 of 100 cases."""
+    return float(norm.ppf(1 - 0.025 / max(count, 1)))
 
 
 def coordinate_map(
@@ -150,7 +155,7 @@ def coordinate_map(
     after: ArrayLike | None = None,
     *,
     label: str,
-    threshold: float | None = None,
+    threshold: float,
 ) -> Figure:
     """Standardised excess energy over one coordinate of the data, before and after the accepted effect.
 
@@ -159,15 +164,13 @@ def coordinate_map(
         before: (coordinate,) excess of the twin as it is, in standard deviations.
         after: (coordinate,) the same with the accepted effect.
         label: name and unit of the coordinate.
-        threshold: all values stay within +-threshold in 95 of 100 data sets when the twin is right; by
-            default that of independent normal values.
+        threshold: all values stay within +-threshold in 95 of 100 data sets when the twin is right; see `usual_limit`.
     """
     names = np.asarray(coordinate)
     place = names if np.issubdtype(names.dtype, np.number) else np.arange(names.size)
-    limit = float(norm.ppf(1 - 0.025 / max(names.size, 1))) if threshold is None else threshold
     with mpl.rc_context(STYLE):
         figure, axes = _figure(2.7)
-        axes.axhspan(-limit, limit, color=LIGHT["floor"], linewidth=0)
+        axes.axhspan(-threshold, threshold, color=LIGHT["floor"], linewidth=0)
         marker = names.size <= 48
         for value, name, shape in ((before, "before", "s"), (after, "after", "o")):
             if value is not None:
@@ -181,8 +184,8 @@ def coordinate_map(
         elif names.size <= 10:
             axes.set_xticks(place)
         axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        if max(np.max(np.abs(np.asarray(before))), limit) > 40 * limit:
-            axes.set_yscale("symlog", linthresh=limit)
+        if max(np.max(np.abs(np.asarray(before))), threshold) > 40 * threshold:
+            axes.set_yscale("symlog", linthresh=threshold)
         if after is not None:
             axes.legend(
                 loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=2, labelcolor="linecolor", borderpad=0

@@ -1,18 +1,16 @@
 """Names and numbers of a report as people say them: effects, sites, sizes, blocks of the data."""
 
+import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, Final
 
-from dtprob.report.advice import family
-from dtprob.report.json_schema import Cause, Coordinates, Detectable, Interval, Remainder, Site, Size
+from dtprob.report.json_schema import Cause, Coordinates, Interval, Remainder, Site, Size
 from dtprob.report.units import (
     Reading,
     decimals_between,
     number,
     percent,
-    quantity,
     reading,
     scale_for,
     split_unit,
@@ -45,16 +43,11 @@ _SITES = {
 }
 
 LEVEL = 0.05
-
-
-@dataclass(frozen=True)
-class DetectableFamily:
-    """What would have been seen of one family: the size of its least visible instance, and their count."""
-
-    name: str
-    parameter: str
-    size: str
-    count: int
+LOG: Final = "log_"
+_LARGEST: Final = 700.0
+"""Largest exponent whose exponential is a number."""
+_DIGITS: Final = 4
+"""Digits of a number in the user's own terms, however little it changes."""
 
 
 def words(name: str) -> str:
@@ -116,8 +109,10 @@ def _varying(pattern: str) -> str:
         return f"in a cycle of {words(pattern.removeprefix('every '))}"
     if first in ("ripple", "by", "along", "over"):
         return f"as a {words(pattern)}" if first == "ripple" else words(pattern)
-    axes = pattern.split(" x ")
-    return f"from {listing(words(axis) for axis in axes)} to {listing(words(axis) for axis in axes)}"
+    axes = [words(axis) for axis in pattern.split(" x ")]
+    if len(axes) == 1:
+        return f"from {axes[0]} to {axes[0]}"
+    return f"with every {listing(axes)} together"
 
 
 def capital(text: str) -> str:
@@ -130,15 +125,22 @@ def size_reading(name: str, size: Size) -> tuple[str, Reading]:
     owner, _, parameter = _stem(name, size).rpartition(".")
     if size.get("unit", "").startswith("Np"):  # shown in dB, which says that it is a logarithm
         parameter = parameter.removeprefix("log_")
+    unit, mean, low, high = _unit(name, size), size["mean"], size["low"], size["high"]
+    if is_factor(parameter, unit):
+        parameter = parameter.removeprefix(LOG)
+        mean, low, high = exponential(mean), exponential(low), exponential(high)
     label = words(parameter) if not owner else f"{words(owner)}: {words(parameter)}"
-    return label, reading(size["mean"], size["low"], size["high"], _unit(name, size))
+    return label, reading(mean, low, high, unit)
 
 
 def apart(name: str, size: Size, estimates: Sequence[float | None]) -> str:
     """Estimates of one parameter from several parts of the data, in the unit of its size."""
-    scale = scale_for([size["mean"], size["low"], size["high"], *estimates], _unit(name, size))
-    decimals = decimals_between(scale(size["low"]), scale(size["high"]))
-    return with_unit(listing(number(scale(value), decimals) for value in estimates), scale.unit)
+    unit, ends, values = _unit(name, size), (size["low"], size["high"]), list(estimates)
+    if is_factor(_stem(name, size).rpartition(".")[2], unit):
+        ends, values = (exponential(ends[0]), exponential(ends[1])), list(map(exponential, values))
+    scale = scale_for([*ends, *values], unit)
+    decimals = decimals_between(scale(ends[0]), scale(ends[1]))
+    return with_unit(listing(number(scale(value), decimals) for value in values), scale.unit)
 
 
 def shares(interval: Interval) -> str:
@@ -175,8 +177,19 @@ def user_terms(name: str, before: float | None, after: float | None) -> list[str
     values = [before] if after is None else [before, after]
     unit = _stem_and_unit(name)[1]
     scale = scale_for(values, unit)
-    decimals = 1 if unit == "dB" else decimals_between(scale(values[0]), scale(values[-1]))
-    return [with_unit(number(scale(value), decimals), scale.unit) for value in values]
+    shown = [scale(value) for value in values]
+    decimals = 1 if unit == "dB" else decimals_between(shown[0], shown[-1])
+    if decimals is not None and shown[0]:
+        decimals = min(decimals, max(_DIGITS - 1 - math.floor(math.log10(abs(shown[0]))), 0))
+    return [with_unit(number(value, decimals), scale.unit) for value in shown]
+
+
+def is_unchanged(name: str, before: float | None, after: float | None) -> bool:
+    """Whether a number in the user's own terms hardly changes: by less than 0.1 dB, or a hundredth of itself."""
+    if before is None or after is None:
+        return False
+    enough = 0.1 if _stem_and_unit(name)[1] == "dB" else 0.01 * abs(before)
+    return abs(after - before) < enough
 
 
 def detail(value: Any) -> str:
@@ -196,28 +209,14 @@ def block(entry: Coordinates) -> str:
     )
 
 
-def detectable_families(entries: Iterable[Detectable]) -> list[DetectableFamily]:
-    """For each family and unit the size from which every instance would have been seen, a dash for none."""
-    groups: dict[tuple[str, str, str], list[Detectable]] = {}
-    for entry in entries:
-        key = (family(entry["effect"]), entry.get("parameter", ""), entry.get("unit", "1"))
-        groups.setdefault(key, []).append(entry)
-    return [
-        DetectableFamily(
-            words(name),
-            words(parameter),
-            quantity(_largest(entry["size"] for entry in group), unit, 2),
-            len(group),
-        )
-        for (name, parameter, unit), group in groups.items()
-    ]
+def is_factor(parameter: str, unit: str) -> bool:
+    """Whether a number is the logarithm of a factor, which people read more easily."""
+    return parameter.startswith(LOG) and unit == "1"
 
 
-def _largest(sizes: Iterable[float | None]) -> float | None:
-    """The largest size; None, which has no bound, is larger than any."""
-    found = list(sizes)
-    known = [size for size in found if size is not None]
-    return max(known) if len(known) == len(found) else None
+def exponential(value: float | None) -> float | None:
+    """A factor from its logarithm; None stays None."""
+    return None if value is None else math.exp(min(value, _LARGEST))
 
 
 def aliases(cause: Cause) -> list[list[str]]:

@@ -9,6 +9,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from dtprob.report import names, units
 from dtprob.report.charts import all_charts
+from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Candidate, Interval, validate
 from dtprob.report.palette import DARK, LIGHT
 from dtprob.report.story import left_over, next_look, next_step, rivals, tell
@@ -55,7 +56,7 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
             next_look=next_look(checked),
             charts={section: [chart for name, chart in charts if name == section] for section, _ in charts},
             candidates=ranked(checked.get("screening", [])),
-            detectable=names.detectable_families(checked["detectable"]),
+            detectable=detectable_families(checked["detectable"]),
             light=LIGHT,
             dark=DARK,
             first=FIRST,
@@ -76,11 +77,12 @@ def bar(size: Interval) -> Bar | None:
 
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
-    """The candidates from the most to the least significant; those that could not be tested come last."""
+    """The candidates from the most to the least significant; those that could not be judged come last."""
 
-    def rank(candidate: Candidate) -> tuple[float, float]:
+    def rank(candidate: Candidate) -> tuple[bool, float, float]:
         adjusted, z = candidate["adjusted_p_value"], candidate["z"]
-        return (2.0 if adjusted is None else adjusted, 0.0 if z is None else -abs(z))
+        untold = bool(candidate.get("absorbed_by"))
+        return (untold, 2.0 if adjusted is None else adjusted, 0.0 if z is None else -abs(z))
 
     return sorted(candidates, key=rank)
 
@@ -117,6 +119,7 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     names.shares,
     names.significant,
     names.detail,
+    names.spoken,
     bar,
 )
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (

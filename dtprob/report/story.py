@@ -5,19 +5,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from dtprob.report.advice import ADVICE, family
+from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Cause, Detectable, Report, Site
 from dtprob.report.names import (
     aliases,
     block,
     capital,
     detail,
-    detectable_families,
+    is_unchanged,
     listing,
     located_words,
     shares,
     significant,
     size_reading,
     spoken,
+    term,
     together,
     words,
 )
@@ -60,15 +62,23 @@ def next_step(report: Report) -> str | None:
     if "design" not in plan:
         return plan.get("description")
     where = {axis: value for axis, value in plan["design"].items() if axis != "design"}
-    place = listing(f"{words(axis)} {detail(value)}" for axis, value in where.items())
+    place = listing(f"{words(axis)}{_places(value)}" for axis, value in where.items())
     offered = plan["design"].get("design")
     place = f"{place} of the design {words(offered)}" if offered else place
     if not plan.get("resolves", True):
         return f"No measurement that is known of tells the explanations apart, however often made; {place} comes nearest."
     times = plan.get("repeats", 1)
-    many = f" {times} times" if times > 1 else ""
+    each = " each" * any(isinstance(value, list | tuple) and len(value) > 1 for value in where.values())
+    many = f" {times} times{each}" if times > 1 else ""
     again = "" if offered else " again"
     return f"Measure {place}{again}{many}: there the explanations differ most.{_saved(plan)}"
+
+
+def _places(value: Any) -> str:
+    """` 3`, or `s 3 and 5`."""
+    if isinstance(value, list | tuple):
+        return f"{'s' * (len(value) > 1)} {listing(map(detail, value))}"
+    return f" {detail(value)}"
 
 
 def next_look(report: Report) -> str:
@@ -79,7 +89,8 @@ def next_look(report: Report) -> str:
         if blocks
         else ""
     )
-    what = f" Look for what could change the {located_words(left[0])} there." if left else ""
+    there = " there" if where else ""
+    what = f" Look for what could change the {located_words(left[0])}{there}." if left else ""
     if not where and not what:
         return "No measurement is proposed."
     return f"No measurement tells unknown causes apart. Look again{where or ' at the data'}.{what}"
@@ -116,13 +127,21 @@ def _codes(report: Report) -> set[str]:
 
 
 def _no_gap(report: Report) -> Story:
-    count = len(report.get("screening", []))
-    tried = f"{count} known effects were tried" if count else "The known effects were tried"
+    screened = report.get("screening", [])
+    untold = sum(bool(row.get("absorbed_by")) for row in screened)
+    tried = (
+        f"{len(screened) - untold} known effects were tried" if screened else "The known effects were tried"
+    )
+    beside = (
+        f" {untold} more could not be judged, because fitted parameters of the twin take up the same change."
+        if untold
+        else ""
+    )
     return Story(
         "No gap found",
         "good",
         "Nothing found: the twin agrees with the data.",
-        f"{tried}; none of them is needed to explain these data, and nothing else was left over. "
+        f"{tried}; none of them is needed to explain these data, and nothing else was left over.{beside} "
         f"{_seen(report['detectable'])}",
         "Nothing to change in the twin.",
     )
@@ -149,7 +168,7 @@ def _listed(report: Report) -> Story:
         "Cause found",
         "found",
         f"The gap comes from {_named(cause)}.",
-        f"{_closing(cause)} {rest}{_looks_alike(cause)}",
+        f"{_closing(cause)} {rest}{_matters(report)}{_looks_alike(cause)}",
         _change(cause),
     )
 
@@ -160,7 +179,7 @@ def _remainder(report: Report) -> Story:
         "Cause found, but something is left",
         "partly",
         f"Part of the gap comes from {_named(cause)}. No known effect explains the rest.",
-        f"{_closing(cause)} What is left is real{_seat(report)}.{_looks_alike(cause)}",
+        f"{_closing(cause)} What is left is real{_seat(report)}.{_matters(report)}{_looks_alike(cause)}",
         f"{_change(cause)} The twin will be closer but not right.",
     )
 
@@ -183,10 +202,7 @@ def _undetermined(report: Report) -> Story:
     wait = f" First: {step[:1].lower() + step[1:].rstrip('.')}." if step else ""
     if len(names) > 1:
         headline = f"There is a gap, but the data cannot tell {listing(names, 'from')}."
-        meaning = (
-            "The gap is real, and each of these explanations fits the data about equally well. "
-            "Choosing one now would be a guess."
-        )
+        meaning = "The gap is real, and none of these explanations can be ruled out. Choosing one now would be a guess."
     else:
         signs = f"signs of {names[0]}" if names else "signs of a gap"
         headline = f"There are {signs}, but the data do not confirm them."
@@ -203,6 +219,15 @@ def _named(cause: Cause) -> str:
     count = len(cause["effects"])
     same = ", or what looks the same in these data" if aliases(cause) else ""
     return f"{_COUNTS.get(count, str(count))} effect{'s' * (count > 1)}: {together(cause['effects'])}{same}"
+
+
+def _matters(report: Report) -> str:
+    """That a cause is sure and yet hardly changes what the user looks at, where that is so."""
+    pairs = report["gap"]["in_user_terms"].items()
+    told = [name for name, pair in pairs if len(pair) > 1 and pair[1] is not None]
+    if not told or not all(is_unchanged(name, *report["gap"]["in_user_terms"][name]) for name in told):
+        return ""
+    return f" It is sure but small: it hardly changes the {listing(term(name) for name in told)}."
 
 
 def _looks_alike(cause: Cause) -> str:

@@ -280,7 +280,7 @@ def test_the_remainder_is_told_with_its_calibration(examples: dict[str, Any]) ->
     assert "vary from link to link" in page.text
     assert "vary by run" in page.text
     assert "vary in a cycle of 7 along slot" in page.text
-    assert "widens the prediction" in page.text
+    assert "becomes wider instead of moving" in page.text
     assert re.search(r"inside their 90% interval 71% 90% 90%", page.text)
     assert any("Share of what is left" in (svg["aria-label"] or "") for svg in page.all("svg"))
     report["remainder"]["before"]["coverage"] = report["remainder"]["after"]["coverage"] = None

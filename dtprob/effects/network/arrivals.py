@@ -184,7 +184,9 @@ def drift(sites: Sites, data: Data) -> list[Effect]:
     for device in range(clusters.devices):
         more, fewer = "a packet where it would have none", "no packet where it would have one"
         for change, name, what in ((joined, "", more), (thinned, "_falling", fewer)):
-            text = f"Device {device} generates {what}, with a probability 1 - exp(-amount x) that grows."
+            text = (
+                f"Device {device} generates {what}: with probability 1 - exp(-amount) by the end of the log."
+            )
             grow = {"arrival_logits": _growing(clusters, device, change)}
             effects.append(_drift(grow, half_normal("amount", 1.0), f"device_{device}{name}", text))
     if offers(sites, "reception_logits"):

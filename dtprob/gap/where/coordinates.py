@@ -36,7 +36,7 @@ def scan_coordinates(
     """Energy of the whitened residuals over dyadic blocks of every axis, against its bootstrap distribution.
 
     Returns the blocks that stand out, family-wise at 1%, and for each axis the energy at its positions in standard
-    deviations.
+    deviations, NaN where nothing is observed.
     """
     observed, null = drawn.observed, drawn.projected
     blocks: list[tuple[str, int, int]] = []
@@ -48,7 +48,10 @@ def scan_coordinates(
         if size < 2:
             continue
         energy = np.stack([_energy(rows, index, size) for rows in (observed, *null)])
-        maps[axis] = (energy[0] - energy[1:].mean(0)) / np.maximum(energy[1:].std(0), 1e-12)
+        spread = energy[1:].std(0)
+        maps[axis] = np.where(
+            spread > 0, (energy[0] - energy[1:].mean(0)) / np.where(spread > 0, spread, 1.0), np.nan
+        )
         cumulative = np.concatenate([np.zeros((len(energy), 1)), np.cumsum(energy, axis=1)], axis=1)
         low, high = np.array(list(_windows(size, ordered=axis != problem.declaration.cluster))).T
         inside = cumulative[:, high + 1] - cumulative[:, low]

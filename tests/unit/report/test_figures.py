@@ -16,6 +16,7 @@ from dtprob.report.figures import (
     gap_track,
     interval_plot,
     plan_view,
+    usual_limit,
 )
 from dtprob.report.palette import DARK, LIGHT, contrast
 from dtprob.report.svg import inline_svg
@@ -32,8 +33,8 @@ def _figures() -> dict[str, Figure]:
         "interval": interval_plot(rows, label="size (m)", null=0.0),
         "gap": gap_track(1.2, 0.1, (0.02, 0.08), unit="nats"),
         "gap without floor": gap_track(-350.2, -360.1, None, unit="nats"),
-        "map": coordinate_map(np.arange(30), value, 0.1 * value, label="antenna"),
-        "names": coordinate_map(["a", "b", "c"], [1.0, 2.0, 900.0], label="object"),
+        "map": coordinate_map(np.arange(30), value, 0.1 * value, label="antenna", threshold=usual_limit(30)),
+        "names": coordinate_map(["a", "b", "c"], [1.0, 2.0, 900.0], label="object", threshold=usual_limit(3)),
         "plan": plan_view(position, position[:2], value, classes=classes, label="excess (nats)"),
         "one link": plan_view(position[:1], position[:1], value[:1], classes=classes, label="excess (nats)"),
     }
@@ -79,10 +80,11 @@ def test_interval_plot_shows_its_numbers() -> None:
 
 
 def test_gap_track_bars_start_at_the_lower_end_of_the_floor() -> None:
-    before, after, floor = _figures()["gap"].axes[0].patches
+    axes = _figures()["gap"].axes[0]
+    before, after = axes.patches
     assert (before.get_x(), before.get_x() + before.get_width()) == pytest.approx((0.02, 1.2))
     assert after.get_x() + after.get_width() == pytest.approx(0.1)
-    assert (floor.get_x(), floor.get_width()) == pytest.approx((0.02, 0.06))
+    assert axes.lines[-1].get_xdata() == pytest.approx((0.02, 0.08))
     assert not _figures()["gap without floor"].axes[0].patches
 
 

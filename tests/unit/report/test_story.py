@@ -2,9 +2,10 @@
 
 from dtprob.report import names
 from dtprob.report.advice import ADVICE, family
-from dtprob.report.json_schema import Cause
+from dtprob.report.detectable import detectable_families
+from dtprob.report.json_schema import Cause, Detectable
 from dtprob.report.page import bar, ranked
-from dtprob.report.story import advice, next_step
+from dtprob.report.story import advice, next_step, tell
 
 
 def _cause(*effects: str, alias: list[list[str]] | None = None) -> Cause:
@@ -43,6 +44,10 @@ def test_user_terms_share_unit_and_decimals() -> None:
     assert names.user_terms("label_rmse", 0.5, None) == ["0.500"]
     assert names.user_terms("channel_nmse_db", -3.14, -17.8) == ["−3.1\u202fdB", "−17.8\u202fdB"]
     assert names.user_terms("delay_s", 1e-9, None) == ["1.00\u202fns"]
+    assert names.user_terms("throughput_error", 0.127013, 0.1270131) == ["0.1270", "0.1270"]
+    assert names.is_unchanged("throughput_error", 0.127, 0.1275)
+    assert not names.is_unchanged("throughput_error", 0.236, 0.219)
+    assert not names.is_unchanged("channel_nmse_db", -20.0, -20.2)
 
 
 def test_estimates_of_strata_share_the_unit_of_the_size() -> None:
@@ -51,14 +56,17 @@ def test_estimates_of_strata_share_the_unit_of_the_size() -> None:
 
 
 def test_detectable_sizes_of_a_family_are_its_worst() -> None:
-    entries: list[names.Detectable] = [
+    entries: list[Detectable] = [
         {"effect": "shift[a]", "size": 0.02, "unit": "m"},
         {"effect": "shift[b]", "size": 0.05, "unit": "m"},
         {"effect": "other", "size": 0.1},
     ]
-    first, second = names.detectable_families(entries)
+    first, second = detectable_families(entries)
     assert (first.name, first.size, first.count) == ("shift", "5.0\u202fcm", 2)
-    assert (second.name, second.size, second.count) == ("other", "0.10", 1)
+    assert first.sizes == "2.0\u202fcm to 5.0\u202fcm"
+    assert (second.name, second.size, second.sizes, second.count) == ("other", "0.10", "0.10", 1)
+    (ratio,) = detectable_families([{"effect": "noise", "size": 0.03, "parameter": "log_ratio"}])
+    assert (ratio.parameter, ratio.size) == ("factor of ratio", "1.030")
 
 
 def test_sizes_drop_the_unit_of_their_key() -> None:
@@ -69,6 +77,18 @@ def test_sizes_drop_the_unit_of_their_key() -> None:
     assert names.size_reading("velocity_x_m_per_s", {**interval, "unit": "m/s"})[0] == "velocity x"
     assert names.size_reading("scale_rad_per_s0.5", {**interval, "unit": "rad/s^0.5"})[0] == "scale"
     assert names.size_reading("delay_s", interval)[0] == "delay"
+
+
+def test_a_logarithm_is_told_as_a_factor() -> None:
+    size: names.Size = {"mean": 0.7, "low": 0.6, "high": 0.8, "unit": "1"}
+    label, shown = names.size_reading("label_noise[x0_low].log_ratio", size)
+    assert (label, shown.mean, shown.low, shown.high) == (
+        "label noise (x0 low): ratio",
+        "2.01",
+        "1.82",
+        "2.23",
+    )
+    assert names.apart("log_ratio", size, [0.6, 0.8]) == "1.82 and 2.23"
 
 
 def test_code_names_in_sentences_become_words() -> None:
@@ -86,6 +106,46 @@ def test_next_step_is_made_from_a_design() -> None:
     assert next_step(report) == "Measure link 17 again 12 times: there the explanations differ most."
     report = {"next_measurement": "Do it."}
     assert next_step(report) == "Do it."
+
+
+def test_a_design_of_several_places_is_measured_at_each() -> None:
+    report: names.Any = {"next_measurement": {"design": {"sample": [173, 347]}, "repeats": 12}}
+    said = "Measure samples 173 and 347 again 12 times each: there the explanations differ most."
+    assert next_step(report) == said
+    report = {"next_measurement": {"design": {"sample": [173]}, "repeats": 1}}
+    assert next_step(report) == "Measure sample 173 again: there the explanations differ most."
+
+
+def test_a_cause_that_changes_nothing_for_the_user_is_called_small() -> None:
+    small = _report(channel_nmse_db=[-20.01, -20.05])
+    assert "hardly changes the channel error (NMSE)" in tell(small).meaning
+    for terms in (
+        {"channel_nmse_db": [-20.0, -21.0]},
+        {"load_error": [0.2, 0.1], "delay_error": [0.2, 0.2]},
+        {},
+    ):
+        assert "hardly" not in tell(_report(**terms)).meaning
+
+
+def test_what_cannot_be_judged_is_said_where_nothing_is_found() -> None:
+    report = {**_report(), "verdict": "NO_GAP", "causes": []}
+    assert "2 known effects were tried" in tell(report).meaning
+    assert "1 more could not be judged" in tell(report).meaning
+
+
+def _report(**terms: list[float]) -> names.Any:
+    row = {"sites": ["y"], "z": 1.0, "p_value": 0.5, "adjusted_p_value": 1.0}
+    absorbed = {"effect": "c", "absorbed_by": "gain", **row}
+    return {
+        "verdict": "LISTED",
+        "causes": [_cause("a")],
+        "where": {"sites": [], "coordinates": []},
+        "gap": {"in_user_terms": terms},
+        "unlisted": {"p_value": 0.5, "sites": []},
+        "detectable": [],
+        "screening": [{"effect": "a", **row}, {"effect": "b", **row}, absorbed],
+        "next_measurement": None,
+    }
 
 
 def test_next_step_says_what_is_saved_and_what_does_not_help() -> None:
@@ -128,4 +188,6 @@ def test_candidates_are_ranked_and_untested_ones_come_last() -> None:
         row("strong", -9.0, 1e-9),
         row("medium", 2.0, 1.0),
     ]
-    assert [candidate["effect"] for candidate in ranked(rows)] == ["strong", "medium", "weak", "none"]
+    rows.append({**row("absorbed", -6.1, 1.0), "absorbed_by": "gain"})
+    ranks = [candidate["effect"] for candidate in ranked(rows)]
+    assert ranks == ["strong", "medium", "weak", "none", "absorbed"]

@@ -10,6 +10,7 @@ import pytest
 from dtprob.errors import InputError
 from dtprob.gap.diagnosis import plain
 from dtprob.report import names, render, to_json, validate
+from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import VERDICTS
 from dtprob.report.page import bar
 from dtprob.report.units import DASH, number, p_value, percent, quantity, reading
@@ -83,5 +84,5 @@ def test_numbers_that_are_not_determined_are_dashes_without_a_unit() -> None:
 
 
 def test_a_family_with_an_instance_that_is_never_seen_has_no_size() -> None:
-    (family,) = names.detectable_families(plain(_report("NO_GAP"))["detectable"])
+    (family,) = detectable_families(plain(_report("NO_GAP"))["detectable"])
     assert (family.size, family.count) == (DASH, 2)
