@@ -103,7 +103,7 @@ def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     axes = [name[len(_BEFORE) :] for name in map(str, data) if _is_before(name) and data[name].count() > 1]
     ordered = sorted(axes, key=lambda axis: named.index(axis) if axis in named else len(named))
     quiet = report["verdict"] == "NO_GAP"
-    return [_coordinate_chart(data, axis, quiet=quiet) for axis in ordered[:_MOST_MAPS]]
+    return [_coordinate_chart(data, axis, quiet=quiet, named=axis in named) for axis in ordered[:_MOST_MAPS]]
 
 
 def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
@@ -182,7 +182,7 @@ def _group(gap: xr.DataTree | None, name: str, report: Report) -> xr.Dataset:
     return dataset[kept].where(np.abs(dataset[kept]) < np.inf)
 
 
-def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool) -> Chart:
+def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) -> Chart:
     complete = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]].dropna(axis)
     before, after = complete[_BEFORE + axis], complete.get(_AFTER + axis)
     place, unit = _places(before, axis)
@@ -206,7 +206,7 @@ def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool) -> Chart:
         caption += f" {unseen} not shown: nothing was observed there."
     if bool((np.abs(before) > limit).any()):
         caption += " One such figure in twenty has a value outside by chance." * quiet
-    elif not quiet:
+    elif not quiet and not named:
         caption += f" No {words(axis)} stands out alone: the gap is a pattern across them."
     return Chart(inline_svg(figure, f"{told}."), caption)
 

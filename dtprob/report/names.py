@@ -38,6 +38,10 @@ _SITES = {
     "noiseless_channel": "channel as a whole",
     "noise_power": "noise level",
     "channel": "measured channel",
+    "arrival_logits": "probabilities of new packets",
+    "reception_logits": "probabilities of reception",
+    "device_advantage": "chances of each device to be heard",
+    "predicted_label": "predicted labels",
     "label_deviation": "size of the labels' errors",
     "y": "labels",
 }
@@ -72,7 +76,7 @@ def spoken(text: str, codes: Iterable[str]) -> str:
     """The text with code names (those with an underscore or an instance) replaced by words."""
     found = sorted((code for code in codes if "_" in code or "[" in code), key=len, reverse=True)
     pattern = "|".join(rf"(?<!\w){re.escape(code)}(?![\w\[])" for code in found)
-    return re.sub(pattern, lambda match: words(match[0]), text) if found else text
+    return re.sub(pattern, lambda match: site_words(match[0]), text) if found else text
 
 
 def listing(items: Iterable[str], last: str = "and") -> str:

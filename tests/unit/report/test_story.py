@@ -96,7 +96,7 @@ def test_code_names_in_sentences_become_words() -> None:
     said = names.spoken(
         "It is shift_all[wall_2] or shift_all at path_delay on arrival (my_shift_all).", codes
     )
-    assert said == "It is shift all (wall 2) or shift all at path delay on arrival (my shift all)."
+    assert said == "It is shift all (wall 2) or shift all at path delays on arrival (my shift all)."
     assert names.spoken("plain", []) == "plain"
 
 
