@@ -1,0 +1,37 @@
+"""Misfit over coordinates: in standard deviations where something is observed, and nothing said where it is not."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dtprob.gap.where.coordinates import scan_coordinates
+
+
+def scanned(observed, null):
+    """The scan of residuals (cluster, row), one row for each of three devices."""
+    position = np.broadcast_to(np.arange(3), observed.shape)
+    rows = SimpleNamespace(
+        located=np.ones(observed.shape), coordinates={"device": position}, by_cluster=lambda values: values
+    )
+    problem = SimpleNamespace(rows=rows, declaration=SimpleNamespace(cluster="link"))
+    return scan_coordinates(problem, SimpleNamespace(observed=observed, projected=null))
+
+
+def test_a_position_without_observations_has_no_excess():
+    rng = np.random.default_rng(0)
+    observed, null = rng.standard_normal((50, 3)), rng.standard_normal((200, 50, 3))
+    observed[:, 2], null[..., 2] = 0.0, 0.0
+    excess = scanned(observed, null)[1]["device"]
+    assert np.isnan(excess[2])
+    energy = (null[..., 0] ** 2).sum(-1)
+    assert excess[0] == pytest.approx(((observed[:, 0] ** 2).sum() - energy.mean()) / energy.std())
+
+
+def test_a_position_that_strays_is_found():
+    rng = np.random.default_rng(1)
+    observed, null = rng.standard_normal((50, 3)), rng.standard_normal((200, 50, 3))
+    observed[:, 1] *= 2
+    blocks, _ = scanned(observed, null)
+    assert (blocks[0].axis, blocks[0].low, blocks[0].high) == ("device", 1, 1)
+    assert blocks[0].p_value < 1e-3
