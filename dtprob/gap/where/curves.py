@@ -28,6 +28,8 @@ _LARGEST: Final = 1 << 18
 """Numbers that the curves over one quantity may take in a band."""
 _FINEST_OVER: Final = 64
 """Half waves of the finest ripple over a quantity of several axes or a site."""
+_OFTEN: Final = 24
+"""Times that a quantity takes each of its values, on average, where each of them may be off by an amount of its own."""
 _TURNS: Final = 24
 """Times that a cycle has to come round: sums of a few entries are far from normal."""
 
@@ -101,10 +103,13 @@ class Quantity:
         return tuple(place) if whole and self.values.shape == tuple(shape[i] for i in place) else None
 
     def curves(self) -> Iterator[Curves]:
-        """Smooth, and ripples over its values."""
+        """Smooth, and ripples over its values; where it takes few, by value, as entries of a table are."""
         flat = self.values.reshape(-1)
         if _ORDER * flat.size > _LARGEST:
             return
+        distinct, index = np.unique(flat, return_inverse=True)
+        if _OFTEN * len(distinct) <= flat.size:
+            yield Curves(f"by value of {self.name}", _grouped(index))
         yield from _over(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
 
 
@@ -137,13 +142,17 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
         if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
             yield from _over(name, column, _FINEST)
         else:
-            grouped = sparse.csr_matrix((np.ones(size), (index, np.arange(size))))
-            yield Curves(f"by {name}", grouped, column=name)
+            yield Curves(f"by {name}", _grouped(index), column=name)
     smooth = [name for name, column in columns.items() if np.issubdtype(column.dtype, np.floating)]
     for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
         crossed = _waves(_rank(columns[one]), 1, _CROSSED), _waves(_rank(columns[other]), 1, _CROSSED)
         products = crossed[0][:, None] * crossed[1][None]
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
+
+
+def _grouped(index: np.ndarray) -> sparse.csr_matrix:
+    """A weight for each group, from the groups of positions (size,)."""
+    return sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))))
 
 
 def cycles(size: int, over: str) -> tuple[Curves, ...]:
