@@ -26,6 +26,10 @@ from dtprob.effects.network.laws import (
 
 _WINDOWS: Final = 8
 """Windows from which on it can be told when in a log a device falls silent."""
+_ONSETS: Final = 32
+"""Times in a log at which a device is looked at whether it falls silent."""
+_MOST_ONSETS: Final = 32
+"""Devices up to which that is done; in larger networks a device is looked at over the whole log."""
 _MOST_PAIRS: Final = 120
 """Pairs of devices in which coupling is looked for; larger networks have none offered."""
 
@@ -36,7 +40,12 @@ def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
     if clusters is None:
         return []
     lasts = sites["arrival_logits"].shape[0] >= _WINDOWS
-    onset = (Parameter("onset", dist.Normal(0.0, 0.5), is_place=True),) if lasts else ()
+    tried = (
+        tuple(np.linspace(0.0, 1.0, _ONSETS, endpoint=False).tolist())
+        if clusters.devices <= _MOST_ONSETS
+        else ()
+    )
+    onset = (Parameter("onset", dist.Normal(0.0, 0.5), is_place=True, tried=tried),) if lasts else ()
     effects: list[Effect] = []
     for device in range(clusters.devices):
 

@@ -31,7 +31,7 @@ _MOST_PRODUCTS: Final = 5e10
 _FINER: Final = (512, 32)
 """Places around which three times finer ones are looked at, and of these again."""
 _PORTION: Final = 576
-"""Places whose scores are told in one run."""
+"""Places whose scores are told in one run, at most."""
 
 
 class _Grid(NamedTuple):
@@ -86,12 +86,13 @@ def _best(
     grid: _Grid,
 ) -> tuple[Placed, np.ndarray]:
     """How the best place of an effect was found, and its flat parameters there."""
-    one_sided = is_one_sided(effect)
+    one_sided, ways = is_one_sided(effect), _ways(grid)
+    portion = min(_PORTION, len(ways) * len(grid.points))  # all looks are compiled once
 
     def told(points: np.ndarray) -> np.ndarray:
         """How many standard deviations (place, n) the scores are from 0."""
-        count = -(-len(points) // _PORTION) * _PORTION
-        padded = points[np.arange(count) % len(points)].reshape(-1, _PORTION, points.shape[1])
+        count = -(-len(points) // portion) * portion
+        padded = points[np.arange(count) % len(points)].reshape(-1, portion, points.shape[1])
         scores = [
             problem.programs.place_scores(effect.name, around, drawn.gradients, part) for part in padded
         ]
@@ -99,7 +100,6 @@ def _best(
         return t if one_sided else np.abs(t)
 
     t = told(grid.points)
-    ways = _ways(grid)
     best, highest = _finer(grid, t[:, 0], ways, lambda points: told(points)[:, 0])
     largest = np.array([highest, *t[:, 1:].max(axis=0)])
     p, replicate_p = np.split(_tail(largest, len(largest) - 2, one_sided=one_sided), [1])
