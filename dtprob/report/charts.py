@@ -204,9 +204,10 @@ def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) 
     unseen = data.sizes[axis] - complete.sizes[axis]
     if unseen:
         caption += f" {unseen} not shown: nothing was observed there."
-    if bool((np.abs(before) > limit).any()):
-        caption += " One such figure in twenty has a value outside by chance." * quiet
-    elif not quiet and not named:
+    outside = bool((np.abs(before) > limit).any())
+    if quiet and outside:
+        caption += " One such figure in twenty has a value outside by chance."
+    if not (quiet or named or outside):
         caption += f" No {words(axis)} stands out alone: the gap is a pattern across them."
     return Chart(inline_svg(figure, f"{told}."), caption)
 

@@ -128,7 +128,7 @@ def size_reading(name: str, size: Size) -> tuple[str, Reading]:
     """The words for a parameter and its size in human units."""
     owner, _, parameter = _stem(name, size).rpartition(".")
     if size.get("unit", "").startswith("Np"):  # shown in dB, which says that it is a logarithm
-        parameter = parameter.removeprefix("log_")
+        parameter = parameter.removeprefix(LOG)
     unit, mean, low, high = _unit(name, size), size["mean"], size["low"], size["high"]
     if is_factor(parameter, unit):
         parameter = parameter.removeprefix(LOG)

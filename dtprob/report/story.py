@@ -223,11 +223,10 @@ def _named(cause: Cause) -> str:
 
 def _matters(report: Report) -> str:
     """That a cause is sure and yet hardly changes what the user looks at, where that is so."""
-    pairs = report["gap"]["in_user_terms"].items()
-    told = [name for name, pair in pairs if len(pair) > 1 and pair[1] is not None]
-    if not told or not all(is_unchanged(name, *report["gap"]["in_user_terms"][name]) for name in told):
+    terms = report["gap"]["in_user_terms"]
+    if not terms or not all(is_unchanged(name, *pair) for name, pair in terms.items()):
         return ""
-    return f" It is sure but small: it hardly changes the {listing(term(name) for name in told)}."
+    return f" It is sure but small: it hardly changes the {listing(map(term, terms))}."
 
 
 def _looks_alike(cause: Cause) -> str:

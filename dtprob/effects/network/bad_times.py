@@ -14,16 +14,13 @@ from jaxtyping import Array, Float
 from dtprob.effects.common import Data, Family, Sites, half_normal, offers
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.network.laws import at, mix
-from dtprob.effects.network.slots import Other, mixed, one_fewer, sender_count, sends
+from dtprob.effects.network.slots import Other, likelihood_ratio, mixed, one_fewer, sender_count, sends
 
 _DURATION: Final = Parameter("log_duration", dist.Normal(1.6, 1.0), -1.0, is_place=True)
 """Logarithm of the number of slots over which bad times are correlated; tells nothing where there are none.
 
 Looked for from nearly no memory: the derivative in a share of bad times of nearly 0 grows without limit in long silences.
 """
-
-_LEAST: Final = 1e-12
-"""Probability below which the twin holds a number of deliveries impossible."""
 
 _SURE: Final = 1e3
 """Odds that one slot can give to one state of the channel over the other."""
@@ -45,7 +42,7 @@ def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
     def silence(value: Any, _: Mapping[str, Any]) -> Any:
         return jnp.broadcast_to(at(0, value.shape[-1]).astype(float), value.shape)
 
-    effects = [
+    return [
         Effect(
             "bursty_channel",
             {"reception_logits": _at_times(silence, "loss")},
@@ -53,9 +50,7 @@ def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
             physics="Nothing is heard in a share 1 - exp(-loss) of the slots, in outages of about exp(log_duration) slots.",
             source="Channel of Gilbert (1960) and Elliott (1963), " + _FILTER,
             requires=("sending", "deliveries", "log_reception"),
-        )
-    ]
-    effects.append(
+        ),
         Effect(
             "bursty_channel",
             {
@@ -69,9 +64,8 @@ def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
             physics="The channel differs at random between windows.",
             source="P(d) exp(s z d), z standard normal per window.",
             field_shape=lambda value, _: (value.shape[0], 1, 1),
-        )
-    )
-    return effects
+        ),
+    ]
 
 
 def interferer(sites: Sites, _data: Data) -> list[Effect]:
@@ -121,9 +115,8 @@ def _at_times(other: Other, parameter: str) -> Callable[[Any, Mapping[str, Any],
     """Another law in bad times, which come and go as a Markov chain of two states does."""
 
     def rewrite(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        law, delivered = other(value, context), jnp.asarray(context["deliveries"])[..., None]
-        good, bad = (jnp.take_along_axis(q, delivered, axis=-1)[..., 0] for q in (jax.nn.softmax(value), law))
-        odds = jnp.minimum(bad / jnp.maximum(good, _LEAST), _SURE)
+        law = other(value, context)
+        odds = jnp.minimum(likelihood_ratio(law, jax.nn.softmax(value), context), _SURE)
         chance = _bad_times(odds, -jnp.expm1(-p[parameter]), jnp.exp(-jnp.exp(-p["log_duration"])))
         return mix(value, law, -jnp.log1p(-chance)[..., None])
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import Any, Final
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from dtprob.effects.network.laws import mix
+
+_LEAST: Final = 1e-12
+"""Probability below which the twin holds a number of deliveries impossible."""
 
 type Other = Callable[[Any, Mapping[str, Any]], Float[Array, "episode slot delivery_count"]]
 """(logits, data) -> probabilities of the number of deliveries where another law holds."""
@@ -32,6 +35,17 @@ def sends(context: Mapping[str, Any], device: int | None) -> Array:
     """Whether the device sends, (episode, slot, 1); whether any does without one."""
     sending = jnp.asarray(context["sending"], bool)
     return (jnp.any(sending, axis=-1) if device is None else sending[..., device])[..., None]
+
+
+def likelihood_ratio(
+    law: Float[Array, "episode slot delivery_count"],
+    usual: Float[Array, "episode slot delivery_count"],
+    context: Mapping[str, Any],
+) -> Float[Array, "episode slot"]:
+    """Probability of what was delivered in each slot under a law, over that under the usual one."""
+    delivered = jnp.asarray(context["deliveries"])[..., None]
+    here, there = (jnp.take_along_axis(p, delivered, axis=-1)[..., 0] for p in (law, usual))
+    return here / jnp.maximum(there, _LEAST)
 
 
 def one_fewer(mass: Float[Array, "*batch delivery_count"]) -> Float[Array, "*batch delivery_count"]:

@@ -13,10 +13,7 @@ from jaxtyping import Array, Float
 from dtprob.effects.common import Data, Family, Sites, half_normal, offers
 from dtprob.effects.effect import Effect
 from dtprob.effects.network.laws import at
-from dtprob.effects.network.slots import mixed, one_fewer, sender_count, sends
-
-_LEAST: Final = 1e-12
-"""Probability below which the twin holds a number of deliveries impossible."""
+from dtprob.effects.network.slots import likelihood_ratio, mixed, one_fewer, sender_count, sends
 
 type Unheard = Callable[[Any, Mapping[str, Any], int], Float[Array, "episode slot delivery_count"]]
 
@@ -109,11 +106,8 @@ def _set_back(
     """
     senders, delivered = sender_count(context), jnp.asarray(context["deliveries"])
     logits = jnp.asarray(context["log_reception"])[senders]
-    law, elsewhere = (
-        jnp.take_along_axis(p, delivered[..., None], axis=-1)[..., 0]
-        for p in (jax.nn.softmax(logits), other(logits, context, device))
-    )
-    own = 1.0 / (1.0 + jnp.expm1(amount) * elsewhere / jnp.maximum(law, _LEAST))
+    ratio = likelihood_ratio(other(logits, context, device), jax.nn.softmax(logits), context)
+    own = 1.0 / (1.0 + jnp.expm1(amount) * ratio)
     is_open = (delivered > 0) & (delivered < senders) & sends(context, device)[..., 0]
     senders, delivered = jnp.where(is_open, senders, 2), jnp.where(is_open, delivered, 1)
     return jnp.where(is_open, jnp.log(own * (senders - delivered) / (senders - own * delivered)), 0.0)

@@ -49,9 +49,8 @@ def scan_coordinates(
             continue
         energy = np.stack([_energy(rows, index, size) for rows in (observed, *null)])
         spread = energy[1:].std(0)
-        maps[axis] = np.where(
-            spread > 0, (energy[0] - energy[1:].mean(0)) / np.where(spread > 0, spread, 1.0), np.nan
-        )
+        beyond, nothing = energy[0] - energy[1:].mean(0), np.full(size, np.nan)
+        maps[axis] = np.divide(beyond, spread, out=nothing, where=spread > 0)
         cumulative = np.concatenate([np.zeros((len(energy), 1)), np.cumsum(energy, axis=1)], axis=1)
         low, high = np.array(list(_windows(size, ordered=axis != problem.declaration.cluster))).T
         inside = cumulative[:, high + 1] - cumulative[:, low]

@@ -121,10 +121,6 @@ class Site:
     kinds: Mapping[str, np.ndarray]
     rows: tuple[int, ...] | None = None
 
-    def entries(self, kind: str) -> np.ndarray:
-        """Scores (n, *site) of a perturbation of every entry; of its parts where it is complex."""
-        return self.gradients * self.kinds[kind]
-
 
 def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients: np.ndarray) -> Site:
     """A deterministic site of the model; `value` may be smaller than the gradients along axes of size 1."""
@@ -185,7 +181,7 @@ def families(along: Along, over: Over, site: Site) -> Iterator[tuple[Family, np.
     """
     patterns = list({(p.label, p.kept): p for p in _patterns(along, over, site)}.values())
     for kind, factor in site.kinds.items():
-        sums = _summed(site.entries(kind), {pattern.kept for pattern in patterns})
+        sums = _summed(site.gradients * factor, {pattern.kept for pattern in patterns})
         summed = {kept: Summed(_parts(values)) for kept, values in sums.items()}
         for pattern in patterns:
             yield Family(kind, pattern, factor), pattern.scores(summed[pattern.kept])
