@@ -16,7 +16,6 @@ from dtprob.effects.common import (
     Sites,
     along,
     half_normal,
-    has_phase,
     normal,
     observable_basis,
     offers,
@@ -147,7 +146,7 @@ def scene_scale(sites: Sites, data: Data) -> list[Effect]:
 
 
 def _movable(sites: Sites, data: Data) -> bool:
-    return has_phase(sites) and offers(sites, "path_delay") and data.get("paths") is not None
+    return offers(sites, "path_delay") and data.get("paths") is not None
 
 
 def _jitter(family: str, sites: Sites, end: str, shift: Any) -> Effect:

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.effects.common import Data, Family, Sites, band, has_phase, normal, offers
+from dtprob.effects.common import Data, Family, Sites, band, normal, offers
 from dtprob.effects.effect import Effect
 from dtprob.effects.solver import gain_beyond
 from dtprob.raytracing.paths import PathSet
@@ -65,7 +65,7 @@ def _at(paths: PathSet, place: np.ndarray) -> jax.Array:
 
 def carrier_mismatch(sites: Sites, data: Data) -> list[Effect]:
     """The carrier is another than the twin assumes."""
-    if not has_phase(sites) or not offers(sites, "path_phase", "path_gain") or data.get("paths") is None:
+    if not offers(sites, "path_delay", "path_gain") or data.get("paths") is None:
         return []
     carrier = float(data["paths"].frequency)
 
@@ -78,7 +78,7 @@ def carrier_mismatch(sites: Sites, data: Data) -> list[Effect]:
     return [
         Effect(
             "carrier_mismatch",
-            {"path_gain": weaken, "path_phase": turn},
+            {"path_gain": weaken} | ({"path_phase": turn} if offers(sites, "path_phase") else {}),
             (normal("offset", 0.1 * carrier, "Hz"),),
             physics="The carrier lies this far above the assumed one: paths turn by it and spread with it; what"
             " it does to materials and arrays is neglected.",
@@ -90,7 +90,7 @@ def carrier_mismatch(sites: Sites, data: Data) -> list[Effect]:
 
 def bandwidth_mismatch(sites: Sites, data: Data) -> list[Effect]:
     """The subcarriers are wider or closer spaced than recorded, and the taps in inverse proportion."""
-    if not has_phase(sites) or not offers(sites, "path_phase", "path_delay"):
+    if not offers(sites, "path_delay"):
         return []
     if band(data) is None or data.get("paths") is None:
         return []
@@ -105,7 +105,7 @@ def bandwidth_mismatch(sites: Sites, data: Data) -> list[Effect]:
     return [
         Effect(
             "bandwidth_mismatch",
-            {"path_delay": stretch, "path_phase": hold},
+            {"path_delay": stretch} | ({"path_phase": hold} if offers(sites, "path_phase") else {}),
             (normal("scale", 0.1),),
             physics="All subcarriers lie this share farther from the carrier than recorded; the carrier stays.",
             source="f_k' tau = f_k (1 + s) tau; the phase that the stretched delay gives the carrier is taken off.",

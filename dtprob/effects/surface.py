@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import jax.numpy as jnp
@@ -29,30 +29,44 @@ from dtprob.raytracing.paths import REFRACTION, SPECULAR, PathSet
 
 
 def material_mismatch(sites: Sites, data: Data) -> list[Effect]:
-    """One object is of another material than the twin takes it for."""
+    """One object is of another material than the twin takes it for, or all of one class where its material is known."""
     if not offers(sites, "permittivity", "conductivity"):
         return []
 
-    def shift(index: int) -> dict[str, Rewrite]:
+    def shift(indices: Sequence[int]) -> dict[str, Rewrite]:
         def permittivity(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-            return value + _only(value, index) * (value - 1.0) * jnp.expm1(p["log_contrast"])
+            return value + _only(value, indices) * (value - 1.0) * jnp.expm1(p["log_contrast"])
 
         def conductivity(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-            return value + _only(value, index) * value * jnp.expm1(p["log_conductivity"])
+            return value + _only(value, indices) * value * jnp.expm1(p["log_conductivity"])
 
         return {"permittivity": permittivity, "conductivity": conductivity}
 
+    single = [((index,), name, name) for index, name in touched_objects(data)]
     return [
         Effect(
             "material_mismatch",
-            shift(index),
+            shift(indices),
             (normal("log_contrast", 0.4), normal("log_conductivity", 1.0)),
-            instance=name,
-            physics=f"Permittivity and conductivity of {name} differ from those of its material.",
+            instance=instance,
+            physics=f"Permittivity and conductivity of {text} differ from those of its material.",
             source="eps' - 1 = (eps - 1) exp(a), sigma' = sigma exp(b); the coefficients follow.",
         )
-        for index, name in touched_objects(data)
+        for indices, instance, text in [*single, *_classes(sites, data)]
     ]
+
+
+def _classes(sites: Sites, data: Data) -> list[tuple[tuple[int, ...], str, str]]:
+    """Objects, instance and text of each material of several objects, unless the model fits materials."""
+    paths: PathSet | None = data.get("paths")
+    if paths is None or "material_permittivity" in sites:
+        return []
+    members: dict[str, list[int]] = {}
+    for index, _ in touched_objects(data):
+        name = paths.material_names[int(np.asarray(paths.object_material)[index])]
+        members.setdefault(name, []).append(index)
+    several = {name: tuple(found) for name, found in members.items() if len(found) > 1}
+    return [(found, f"all_{name}", f"everything of {name}") for name, found in several.items()]
 
 
 def thickness_mismatch(sites: Sites, data: Data) -> list[Effect]:
@@ -62,7 +76,7 @@ def thickness_mismatch(sites: Sites, data: Data) -> list[Effect]:
 
     def shift(index: int) -> Rewrite:
         def thickness(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-            return value + _only(value, index) * value * jnp.expm1(p["log_thickness"])
+            return value + _only(value, [index]) * value * jnp.expm1(p["log_thickness"])
 
         return thickness
 
@@ -177,8 +191,8 @@ def _each_time(code: int) -> Callable[[int], Rewrite]:
     return change
 
 
-def _only(value: Float[Array, " object"], index: int) -> Array:
-    return jnp.arange(value.shape[0]) == index
+def _only(value: Float[Array, " object"], indices: Sequence[int]) -> Array:
+    return jnp.isin(jnp.arange(value.shape[0]), jnp.asarray(indices))
 
 
 def _per_object(

@@ -44,7 +44,7 @@ from dtprob.workflow.prepare import Prepared, prepare
 
 RUNS: Final = 1
 SETTINGS: Final = Settings(
-    replicates=100, site_replicates=19, candidates=6, polished=0, max_effects=1, folds=3, grid=24, starts=1
+    replicates=100, site_replicates=19, candidates=6, polished=0, max_effects=1, folds=3, grid=24, starts=3
 )
 """Of every diagnosis: one effect, no freeing from local optima."""
 _SAME_PLACE: Final = 1e-3
@@ -132,7 +132,7 @@ def answer(
         found = _diagnosed(prepared, key, SETTINGS, say)
         reached = _numbers(prepared.case.data.file, prepared.data["paths"])
     links = found.maps["links"]
-    per_link = prepared.data["channel"][0].size
+    per_link = prepared.data["power"][0].size
     before = per_link * (np.asarray(links["before"]) + links.attrs["floor"])
     after = per_link * (np.asarray(links["after"]) + links.attrs["floor"]) if found.causes else before
     cause = found.causes[0] if found.causes else None

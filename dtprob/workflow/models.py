@@ -69,6 +69,11 @@ MODELS: Mapping[str, Entry] = {
         ChannelData,
         {name: f"dtprob.models.ultra_wideband:{name}" for name in ("rough_delay", "link_power")},
     ),
+    "ultra_wideband_profile": Entry(
+        "dtprob.models.ultra_wideband:ultra_wideband_profile",
+        ChannelData,
+        arrange="dtprob.models.ultra_wideband:delay_profile",
+    ),
     "label_twin": Entry(
         "dtprob.models.label_twin:label_twin", Labels, arrange="dtprob.models.label_twin:labelled_rows"
     ),

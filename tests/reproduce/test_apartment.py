@@ -3,9 +3,11 @@
 import csv
 import json
 import re
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import xarray as xr
 
 from dtprob.case import load_case
 from dtprob.data.location import measured_data
@@ -86,7 +88,8 @@ def test_the_figure_counts_what_is_right(monkeypatch):
         f"right first in 1 of {able}, inside the class in 1; of those whose extra gap is established right first in 1 of 2,"
         " inside the class in 1"
     )
-    assert "extra gap 105.0 nats (105.0 to 105.0), 0.80 of it closed" in next(
+    extra = f"{5.0 * len(LINKS)}"
+    assert f"extra gap {extra} nats ({extra} to {extra}), 0.80 of it closed" in next(
         note for note in figure.notes if "swap_2_4" in note
     )
 
@@ -184,6 +187,26 @@ def test_every_twin_can_be_traced(measured, tmp_path, twin: Twin):
     wrong = {int(np.flatnonzero(np.isclose(places, place).all(axis=1))[0]) for place in twin.anchor.values()}
     named = {n for name in twin.undone_by for n in map(int, re.findall(r"\d+", name.partition("[")[2]))}
     assert wrong == named
+
+
+@pytest.mark.measured
+def test_losses_are_counted_in_nats_of_a_link(measured, monkeypatch):
+    """A diagnosis gives them for each observed power, above a floor."""
+    del measured
+
+    def diagnosed(prepared, key, settings, say):
+        del key, settings, say
+        n = prepared.data["power"].shape[0]
+        links = xr.Dataset(
+            {"before": ("link", np.full(n, 3.0)), "after": ("link", np.full(n, 2.0))}, attrs={"floor": -1.0}
+        )
+        return SimpleNamespace(maps={"links": links}, causes=(), verdict="NO_GAP")
+
+    monkeypatch.setattr(apartment, "_diagnosed", diagnosed)
+    found = apartment.answer(TWINS[0], apartment.jax.random.key(0))
+    assert found.link.tolist() == list(LINKS)
+    assert np.allclose(found.before, 63 * 2.0)
+    assert np.allclose(found.after, found.before)  # nothing is named
 
 
 def _holds(polygon, x, y):

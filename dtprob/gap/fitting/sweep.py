@@ -1,7 +1,8 @@
-"""Cluster-local coordinates out of wrong basins: angles, and what is found only together with an angle.
+"""Cluster-local coordinates out of wrong basins: angles, few others, and what is found only together with an angle.
 
-A delay turns a narrow-band signal, so a link's delay and phase have many optima that neither leaves alone. Clusters are
-independent given the shared coordinates: one set of trials serves all of them.
+A delay turns a narrow-band signal, so a link's delay and phase have many optima that neither leaves alone; where only
+powers are seen, a delay far from its place has no slope. Clusters are independent given the shared coordinates: one set
+of trials serves all of them.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ class _Local(NamedTuple):
 
 
 def swept(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) -> np.ndarray:
-    """The point with angles, and few other coordinates beside them, where each cluster is best over their whole range.
+    """The point where each cluster is best over the whole range of its few coordinates: one alone, or with an angle.
 
     Args:
         problem: the model on its data.
@@ -44,18 +45,28 @@ def swept(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) ->
     found = _locals(problem)
     turns = [one for one in found if one.is_angle]
     others = [one for one in found if not one.is_angle]
-    if not others or len(turns) * len(others) > _MOST:
+    if not others or max(len(turns), 1) * len(others) > _MOST:
         return x
     x, value = x.copy(), np.nan_to_num(terms(x), nan=-np.inf)
-    for turn in turns:
-        for other in others:
-            start = x.copy()
-            for place in _places(problem, other.name):
-                for angle in _circle():
-                    moved = start.copy()
-                    moved[other.positions], moved[turn.positions] = place, start[turn.positions] + angle
-                    value = _kept(x, value, moved, terms(moved), (turn, other))
+    for other in others:
+        for pair in [(turn, other) for turn in turns] or [(other,)]:
+            value = _together(problem, x, value, terms, pair)
     return x
+
+
+def _together(
+    problem: Problem, x: np.ndarray, value: np.ndarray, terms: Terms, coordinates: tuple[_Local, ...]
+) -> np.ndarray:
+    """Terms after clusters of x have taken their best places of the last coordinate, with an angle before it or without."""
+    start, *turns, other = x.copy(), *coordinates
+    for place in _places(problem, other.name):
+        for angle in _circle() if turns else [0.0]:
+            moved = start.copy()
+            moved[other.positions] = place
+            for turn in turns:
+                moved[turn.positions] += angle
+            value = _kept(x, value, moved, terms(moved), coordinates)
+    return value
 
 
 def turned(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) -> np.ndarray:

@@ -148,6 +148,17 @@ def test_material_of_one_object_only(apply):
     assert np.allclose(sites["conductivity"], [0.05, 0.06, 0.05, 0.02])
 
 
+def test_material_of_all_objects_of_one_class(world, apply):
+    sites = apply("material_mismatch[all_brick]", log_contrast=np.log(2.0), log_conductivity=np.log(3.0))
+    before = apply()
+    brick = np.array([False, True, False, True])
+    assert np.allclose(sites["permittivity"], before["permittivity"] + brick * (before["permittivity"] - 1))
+    assert np.allclose(sites["conductivity"], before["conductivity"] * np.where(brick, 3.0, 1.0))
+    fitted = {**world.sites, "material_permittivity": world.sites["permittivity"]}
+    names = [effect.name for effect in catalogue(fitted, world.data, ["material_mismatch"])]
+    assert names == [f"material_mismatch[{name}]" for name in ("east", "slanted", "floor", "partition")]
+
+
 def test_missing_path_and_blockage(world, apply):
     order = np.sum(np.asarray(world.data["paths"].interaction) != 0, axis=-1)
     before = apply()["path_gain"]

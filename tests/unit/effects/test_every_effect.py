@@ -25,7 +25,7 @@ PINNED = {
 NAMES = {
     "polarization_mismatch": ["rx", "tx"],
     "object_displacement": ["east", "slanted", "floor"],
-    "material_mismatch": ["east", "slanted", "floor", "partition"],
+    "material_mismatch": ["east", "slanted", "floor", "partition", "all_concrete", "all_brick"],
     "array_calibration": ["rx", "rx_0", "rx_1", "rx_2", "rx_3", "tx", "tx_0", "tx_1", "tx_2"],
     "missing_path": [
         *("line_of_sight", "reflection", "refraction", "order_1", "order_2", "east", "slanted", "floor"),

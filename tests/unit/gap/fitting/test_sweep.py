@@ -22,6 +22,7 @@ FREQUENCY = np.linspace(8.0, 14.0, 12)
 LATE = np.array([-1.6, -0.7, 0.0, 0.9, 1.7])
 PHASE = np.array([0.3, -2.0, 1.0, 2.9, -0.6])
 NOISE = 0.1
+TAPS = np.linspace(-3.0, 3.0, 31)
 BEND = Effect(
     "bend", {"level": lambda value, p, _: value + p["by"]}, (Parameter("by", dist.Normal(0.0, 1.0)),)
 )
@@ -91,6 +92,25 @@ def test_a_sweep_keeps_what_is_best_and_what_is_shared(problem):
     np.testing.assert_array_equal(found[shared], free.x[shared])
     nowhere = swept(problem, free.x, lambda x: np.full(len(LATE), np.nan))
     np.testing.assert_array_equal(nowhere, free.x)
+
+
+@model(cluster="link", axes={"power": ("link", "tap")})
+def pulsed(links, y=None):
+    """A narrow pulse over taps, far from which its place has no slope."""
+    with numpyro.plate("link", links, dim=-2):
+        late = numpyro.sample("late", dist.Normal(0.0, 1.0))
+        power = numpyro.deterministic("power", jnp.exp(-0.5 * ((TAPS - late) / 0.2) ** 2))
+        with numpyro.plate("tap", len(TAPS), dim=-1):
+            numpyro.sample("y", dist.Normal(power, NOISE), obs=y)
+
+
+def test_a_place_without_an_angle_is_looked_for_too():
+    noise = NOISE * np.random.default_rng(3).normal(size=(len(LATE), len(TAPS)))
+    power = np.exp(-0.5 * ((TAPS - LATE[:, None]) / 0.2) ** 2)
+    problem = Problem(pulsed, {"links": len(LATE), "y": jnp.asarray(power + noise)}, [])
+    stuck = fitting.fit(problem, problem.start({"late": np.zeros((5, 1))}))
+    assert np.abs(places(problem, stuck.x) - LATE).max() > 0.3
+    np.testing.assert_allclose(places(problem, settled(problem, stuck).x), LATE, atol=0.1)
 
 
 def test_large_sizes_are_tried_with_the_links_found_anew(problem):

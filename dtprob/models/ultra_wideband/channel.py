@@ -10,7 +10,7 @@ before (`dtprob.data.uwb_apartment`).
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, Literal, NamedTuple, get_args
+from typing import Any, Final, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -32,45 +32,29 @@ from dtprob.models.scene import (
     unknown_noise_power,
     unknown_phase,
 )
+from dtprob.models.ultra_wideband.receiver import (
+    GAIN_SPREAD,
+    RANGING_SPREAD,
+    RANGING_TAIL,
+    Receiver,
+    gain_law,
+    ranging_offset,
+    turn,
+    unknown_levels,
+    unknown_pulse,
+)
 from dtprob.raytracing import field
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.phasor import phasor
 from dtprob.raytracing.slab import Law
 
 _AXES: Final = AXES | {"receiver_gain": ("link",), "receiver_delay": ("link",)}
-_LOG_GAINS: Final = range(1, 9)
-_PHASES: Final = range(2, 9)
 _DELAY_SPREAD: Final = 0.5e-9
-_RANGING_OFFSET: Final = (2.0e-9, 1.0e-9)
-"""Mean and standard deviation, s, of what is common to all errors of ranging, the rise of the pulse included."""
-_RANGING_SPREAD: Final = 0.6e-9
-_RANGING_TAIL: Final = 3.0
-_GAIN_SPREAD: Final = 0.35
-_TRANSMITTED: Final = 3.7e-5
-_SATURATED: Final = 1.3e-11
 _LAGS: Final = np.arange(-2e-9, 14e-9, 0.1e-9)
 
 
 type TimeOrigin = Literal["searched", "ranged"]
 """What is known of a link's time origin: where the data match the twin, or what two-way ranging says."""
-
-
-class _Receiver(NamedTuple):
-    """What is unknown of the receiver, per link, and its gain law.
-
-    Attributes:
-        phase: rad, (link,).
-        delay: of its time origin, s, (link,).
-        log_gain: departure from the gain law, Np, (link,).
-        transmitted: radiated power, W.
-        saturated: the reported level that no link exceeds, W.
-    """
-
-    phase: jax.Array
-    delay: jax.Array
-    log_gain: jax.Array
-    transmitted: jax.Array
-    saturated: jax.Array
 
 
 @model(axes=_AXES, cluster="link")
@@ -123,8 +107,8 @@ def ultra_wideband_channel(
         raise InputError("phase", "per_packet", repr(phase), 'Set phase = "per_packet" in [data]')
     shape = channel_shape(paths, subcarrier_frequency, channel=channel)
     room = traced_gain(paths, materials, law)
-    receiver = _receiver(shape[0], rough_delay, time_origin)
-    noiseless = _received(paths, subcarrier_frequency, room, receiver)
+    receiver, angle = _unknown_receiver(shape[0], rough_delay, time_origin)
+    noiseless = _received(paths, subcarrier_frequency, room, receiver, angle)
     noise = site("noise_power", _variance(paths, noise_power, link_power, model_error, shape[1]))
     observe(noiseless, noise, shape, channel)
     return noiseless
@@ -170,70 +154,39 @@ def _variance(
     return jnp.broadcast_to(noise_power + error, (paths.n_link,)).reshape((-1, 1, 1, 1, 1))
 
 
-def _receiver(links: int, rough: jax.Array | None, time_origin: TimeOrigin) -> _Receiver:
+def _unknown_receiver(
+    links: int, rough: jax.Array | None, time_origin: TimeOrigin
+) -> tuple[Receiver, jax.Array]:
+    """The receiver, and the phase of each link, rad."""
     error: Any = dist.Normal(0.0, 1.0)
     around, spread = 0.0 if rough is None else rough, _DELAY_SPREAD
     if time_origin == "ranged":
-        offset: Any = numpyro.sample("ranging_offset", dist.Normal(0.0, 1.0))
-        around, spread = _RANGING_OFFSET[0] + _RANGING_OFFSET[1] * offset, _RANGING_SPREAD
-        error = dist.StudentT(_RANGING_TAIL, 0.0, 1.0)
-    transmitted: Any = numpyro.sample("transmitted_power", dist.LogNormal(np.log(_TRANSMITTED), 1.0))
-    saturated: Any = numpyro.sample("saturated_level", dist.LogNormal(np.log(_SATURATED), 0.5))
+        around, spread = ranging_offset(), RANGING_SPREAD
+        error = dist.StudentT(RANGING_TAIL, 0.0, 1.0)
+    transmitted, saturated = unknown_levels()
     with numpyro.plate("link", links, dim=-1):
         phase: Any = numpyro.sample("link_phase", unknown_phase())
         delay: Any = numpyro.sample("link_delay", error)
         log_gain: Any = numpyro.sample("link_gain", dist.Normal(0.0, 1.0))
-    return _Receiver(phase, around + spread * delay, _GAIN_SPREAD * log_gain, transmitted, saturated)
-
-
-def _pulse(subcarrier_frequency: jax.Array) -> jax.Array:
-    """Response of pulse and filters, (subcarrier,): common to all links, no constant, no delay."""
-    low, high = jnp.min(subcarrier_frequency), jnp.max(subcarrier_frequency)
-    x = (2.0 * subcarrier_frequency - low - high) / (high - low)
-    orders = _legendre(x, max(*_LOG_GAINS, *_PHASES))
-    with numpyro.plate("log_gain_order", len(_LOG_GAINS)):
-        log_gain: Any = numpyro.sample("pulse_log_gain", dist.Normal(0.0, 0.3))
-    with numpyro.plate("phase_order", len(_PHASES)):
-        turn: Any = numpyro.sample("pulse_phase", dist.Normal(0.0, 0.5))
-    exponent = log_gain @ orders[_LOG_GAINS.start : _LOG_GAINS.stop]
-    return jnp.exp(exponent) * _turn(turn @ orders[_PHASES.start : _PHASES.stop])
-
-
-def _turn(phase: jax.Array) -> jax.Array:
-    return jax.lax.complex(jnp.cos(phase), jnp.sin(phase))
-
-
-def _legendre(x: jax.Array, highest: int) -> jax.Array:
-    """Legendre polynomials of orders 0 to `highest`, (order, subcarrier)."""
-    rows = [jnp.ones_like(x), x]
-    for n in range(1, highest):
-        rows.append(((2 * n + 1) * x * rows[n] - n * rows[n - 1]) / (n + 1))
-    return jnp.stack(rows)
+    return Receiver(around + spread * delay, GAIN_SPREAD * log_gain, transmitted, saturated), phase
 
 
 def _received(
-    paths: PathSet, subcarrier_frequency: jax.Array, gain: jax.Array, receiver: _Receiver
+    paths: PathSet, subcarrier_frequency: jax.Array, gain: jax.Array, receiver: Receiver, phase: jax.Array
 ) -> jax.Array:
     """The site `noiseless_channel` and those that lead to it from the gains of the paths."""
     delay = site("path_delay", paths.delay)
     departure = site("departure", paths.departure)
     arrival = site("arrival", paths.arrival)
-    turned = jnp.broadcast_to(receiver.phase[:, None, None], (gain.shape[0], 1, gain.shape[1]))
+    turned = jnp.broadcast_to(phase[:, None, None], (gain.shape[0], 1, gain.shape[1]))
     path_phase = site("path_phase", turned)
     tx_response = site("tx_response", array_response(None, departure, paths.frequency, 1.0))
     rx_response = site("rx_response", array_response(None, arrival, paths.frequency, -1.0))
-    common = site("frequency_response", _pulse(subcarrier_frequency))
+    common = site("frequency_response", unknown_pulse(subcarrier_frequency))
     response = field.frequency_response(paths, subcarrier_frequency, delay)
-    traced = field.synthesize(gain, response, rx_response, tx_response, _turn(path_phase))
+    traced = field.synthesize(gain, response, rx_response, tx_response, turn(path_phase))
     level = jnp.mean(jnp.real(traced) ** 2 + jnp.imag(traced) ** 2, axis=(1, 2, 3, 4))
-    amplitude = site("receiver_gain", _gain_law(level, receiver))
+    amplitude = site("receiver_gain", gain_law(level, receiver))
     late = site("receiver_delay", receiver.delay)
     own = amplitude[:, None] * phasor(-late[:, None] * subcarrier_frequency)
     return site("noiseless_channel", traced * (own * common)[:, None, None, None, :])
-
-
-def _gain_law(level: jax.Array, receiver: _Receiver) -> jax.Array:
-    """Amplitude by which the receiver scales the channel, (link,), given its path gain in power."""
-    return jnp.exp(receiver.log_gain) * jnp.sqrt(
-        receiver.transmitted / (1.0 + receiver.transmitted * level / receiver.saturated)
-    )
