@@ -29,7 +29,7 @@ from dtprob.raytracing.paths import REFRACTION, SPECULAR, PathSet
 
 
 def material_mismatch(sites: Sites, data: Data) -> list[Effect]:
-    """One object is of another material than the twin takes it for, or all of one class where its material is known."""
+    """One object, or everything of one known material, is of another than the twin takes it for."""
     if not offers(sites, "permittivity", "conductivity"):
         return []
 

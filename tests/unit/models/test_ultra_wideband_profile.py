@@ -46,6 +46,7 @@ def at(paths, **values):
         "tail_share": jnp.asarray(1e-12),
         "shape": jnp.asarray(1.0),
     }
+    start |= {"floor": jnp.asarray(1e-12)}
     trace = trace_model(ultra_wideband_profile, data, jax.random.key(0), start | values)
     return {name: np.asarray(message["value"]) for name, message in trace.items()}
 
@@ -79,6 +80,13 @@ def test_the_tail_is_exponential_behind_the_first_path(paths):
         late = behind > 8 * step
         expected = 0.2 * level * step / decay * np.exp(-behind[late] / decay)
         np.testing.assert_allclose(tail[late], expected, rtol=1e-3)
+
+
+def test_the_floor_is_the_same_under_all_taps(paths):
+    plain, sites = at(paths)["tap_power"], at(paths, floor=jnp.asarray(0.3))["tap_power"]
+    np.testing.assert_allclose(
+        sites - plain, np.repeat(0.3 * plain.mean(axis=1, keepdims=True), 49, axis=1), rtol=1e-2
+    )
 
 
 def test_the_time_origin_is_late_by_the_errors_of_ranging(paths):
