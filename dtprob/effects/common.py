@@ -13,7 +13,7 @@ import numpyro.distributions as dist
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from dtprob.effects.effect import Effect, Parameter
+from dtprob.effects.effect import Effect, Parameter, Rewrite
 from dtprob.raytracing.paths import NONE, PathSet
 
 
@@ -73,6 +73,11 @@ def half_normal(name: str, scale: float, unit: str = "1") -> Parameter:
 def offers(sites: Sites, *names: str) -> bool:
     """Whether the model computes all these sites."""
     return all(name in sites and sites[name].kind == "deterministic" for name in names)
+
+
+def of_model(sites: Sites, table: Mapping[str, Rewrite]) -> dict[str, Rewrite]:
+    """Those of the rewrites whose site the model computes."""
+    return {name: rewrite for name, rewrite in table.items() if offers(sites, name)}
 
 
 def has_phase(sites: Sites) -> bool:

@@ -18,6 +18,7 @@ from dtprob.effects.common import (
     half_normal,
     normal,
     observable_basis,
+    of_model,
     offers,
     touched_objects,
 )
@@ -137,7 +138,7 @@ def scene_scale(sites: Sites, data: Data) -> list[Effect]:
     return [
         Effect(
             "scene_scale",
-            {name: rewrite for name, rewrite in table.items() if offers(sites, name)},
+            of_model(sites, table),
             (normal("scale", 1e-3),),
             physics="All lengths of the scene, antennas' places included, are off by one factor.",
             source="tau' = tau (1 + s), free-space loss 1 / L.",

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.effects.common import Data, Family, Sites, band, normal, offers
+from dtprob.effects.common import Data, Family, Sites, band, normal, of_model, offers
 from dtprob.effects.effect import Effect
 from dtprob.effects.solver import gain_beyond
 from dtprob.raytracing.paths import PathSet
@@ -78,7 +78,7 @@ def carrier_mismatch(sites: Sites, data: Data) -> list[Effect]:
     return [
         Effect(
             "carrier_mismatch",
-            {"path_gain": weaken} | ({"path_phase": turn} if offers(sites, "path_phase") else {}),
+            of_model(sites, {"path_gain": weaken, "path_phase": turn}),
             (normal("offset", 0.1 * carrier, "Hz"),),
             physics="The carrier lies this far above the assumed one: paths turn by it and spread with it; what"
             " it does to materials and arrays is neglected.",
@@ -105,7 +105,7 @@ def bandwidth_mismatch(sites: Sites, data: Data) -> list[Effect]:
     return [
         Effect(
             "bandwidth_mismatch",
-            {"path_delay": stretch} | ({"path_phase": hold} if offers(sites, "path_phase") else {}),
+            of_model(sites, {"path_delay": stretch, "path_phase": hold}),
             (normal("scale", 0.1),),
             physics="All subcarriers lie this share farther from the carrier than recorded; the carrier stays.",
             source="f_k' tau = f_k (1 + s) tau; the phase that the stretched delay gives the carrier is taken off.",

@@ -24,7 +24,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 from scipy.constants import speed_of_light
 
-from dtprob.effects.common import Sites, meets, offers
+from dtprob.effects.common import Sites, meets, of_model
 from dtprob.effects.effect import Rewrite
 from dtprob.raytracing.paths import SPECULAR, PathSet
 
@@ -69,7 +69,7 @@ def rewrites(sites: Sites, shift: Shift) -> dict[str, Rewrite]:
         "arrival": lambda value, p, context: value + change(p, context).arrival,
         "path_gain": gain,
     }
-    return {name: rewrite for name, rewrite in table.items() if offers(sites, name)}
+    return of_model(sites, table)
 
 
 @jax.jit

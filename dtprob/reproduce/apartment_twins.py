@@ -22,6 +22,8 @@ LINKS: Final = (
 )
 """Numbers of the measured links."""
 CARRIER: Final = 3.9936e9
+THICKNESS: Final = 0.05
+"""Of the walls, in m, as the description of the set says."""
 
 
 class Twin(NamedTuple):
@@ -30,8 +32,7 @@ class Twin(NamedTuple):
     Attributes:
         name: of the twin.
         wrong: in words.
-        undone_by: families, or instances, any of which is right; empty where nothing is wrong or where the unknown
-            parameters of the twin undo it themselves.
+        undone_by: families, or instances, any of which is right; empty where nothing is wrong.
         wall: number of the wall that the floor plan lacks.
         wall_ends: where it stands, (x, y, x, y) in m.
         anchor: for each anchor's number, the place (x, y) in m that the table of links gives instead.
@@ -203,14 +204,14 @@ def _case(twin: Twin, known: Sequence[str], offered: Sequence[str] | None) -> st
         "device_height": 1.2,
         "ceiling_height": 2.6,
         "wall_material": "concrete",
-        "wall_thickness": 0.05,
+        "wall_thickness": THICKNESS,
         "samples": 300_000,
         "strongest": 12,
         "check_depth": 8,
         **twin.scene,
     }
     if offered is None:
-        walls = f"material_mismatch[all_{scene['wall_material']}_50mm]"
+        walls = f"material_mismatch[all_{scene['wall_material']}_{1e3 * THICKNESS:g}mm]"
         offered = (*EFFECTS, walls) if scene["refraction"] else (*EFFECTS, walls, "refraction_off")
     left_out = [name for name in LEFT_OUT if name.partition("[")[0] in offered]
     scene["check_transmitters"] = any(name in _SWAPS for name in offered)

@@ -39,14 +39,16 @@ def at(paths, **values):
     n = paths.n_link
     data = {"paths": paths, "subcarrier_frequency": jnp.asarray(FREQUENCY), "tap_delay": jnp.asarray(TAPS)}
     null = {"link_delay": n, "link_gain": n, "pulse_log_gain": 8, "pulse_phase": 7}
-    start = {name: jnp.zeros(size) for name, size in null.items()}
-    start |= {"transmitted_power": jnp.asarray(TRANSMITTED), "saturated_level": jnp.asarray(SATURATED)}
-    start |= {
-        "ranging_offset": jnp.asarray(-2.0),
-        "tail_share": jnp.asarray(1e-12),
-        "shape": jnp.asarray(1.0),
+    single = {
+        "transmitted_power": TRANSMITTED,
+        "saturated_level": SATURATED,
+        "ranging_offset": -2.0,
+        "tail_share": 1e-12,
+        "floor": 1e-12,
+        "shape": 1.0,
     }
-    start |= {"floor": jnp.asarray(1e-12)}
+    start = {name: jnp.zeros(size) for name, size in null.items()}
+    start |= {name: jnp.asarray(value) for name, value in single.items()}
     trace = trace_model(ultra_wideband_profile, data, jax.random.key(0), start | values)
     return {name: np.asarray(message["value"]) for name, message in trace.items()}
 
