@@ -46,7 +46,11 @@ from dtprob.inference import Laplace  # noqa: E402
 from dtprob.models.complex_normal import ComplexNormal  # noqa: E402
 from dtprob.models.declaration import model  # noqa: E402
 
-CASES = [(n, 100, 64) for n in (16, 64, 256, 1024)] + [(64, n, 64) for n in (10, 1000)]
+CASES = (
+    [(n, 100, 64) for n in (16, 64, 256, 1024)]
+    + [(64, n, 64) for n in (10, 1000, 10_000)]
+    + [(250, 1000, 256)]
+)
 PATHS, GRADIENTS = 4, 20
 NOISE, LAMBDA = 0.2, 100.0
 
@@ -88,7 +92,7 @@ def candidates(count: int, links: int) -> list[Effect]:
 
 
 def data(count: int, links: int, outputs: int) -> dict[str, Any]:
-    """A measurement of which the twin lacks the first ripple."""
+    """A measurement of which the twin lacks the middle ripple: the first ones look like another gain of the front end."""
     rng = np.random.default_rng(0)
 
     def normal(*shape: int) -> np.ndarray:
@@ -97,7 +101,7 @@ def data(count: int, links: int, outputs: int) -> dict[str, Any]:
     gain, delay = normal(links, PATHS), rng.uniform(0.0, 0.4, (links, PATHS)) * outputs / 64
     frequency = np.arange(outputs) - (outputs - 1) / 2
     clean = np.einsum("lp,lpk->lk", gain, np.exp(-2j * np.pi * delay[..., None] * frequency))
-    ripple = clean * np.cos(2 * np.pi / count * frequency)
+    ripple = clean * np.cos(2 * np.pi * (count // 4 + 1) / count * frequency)
     share = np.sqrt(LAMBDA / (2 * np.sum(np.abs(ripple) ** 2) / NOISE**2))
     y = clean + share * ripple + NOISE * normal(links, outputs)
     return {"gain": gain, "delay": delay, "frequency": frequency, "y": y}

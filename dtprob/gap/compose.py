@@ -8,24 +8,21 @@ from typing import Any
 
 import jax
 import numpy as np
-import xarray as xr
 
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.terms import in_user_terms
+from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.locate import SiteFinding
 from dtprob.gap.where.reach import touched
 from dtprob.gap.which.screen import Screening
+from dtprob.gap.which.trials import credit
 from dtprob.inference.engine import AbstractEngine
 
 _DRAWS = 200
 _MOST_ALIKE = 300
 """Candidates up to which a report tells how much each looks like each."""
-_PATHS = "path_gain"
-"""The site that has an entry for each path."""
-_MOST_STEPS = 200_000
-"""Steps of paths beyond which a scene is not drawn."""
 
 
 def compose(
@@ -40,6 +37,7 @@ def compose(
     """The diagnosis with all sections of the report."""
     first = evidence.steps[0].view.screening
     sections: dict[str, Any] = {
+        "tried": _tried(evidence),
         "where": _where(evidence),
         "gap": _gap(evidence),
         "unlisted": {
@@ -61,7 +59,7 @@ def compose(
             **_alike(first),
         },
     }
-    return Diagnosis(verdict, summary(verdict, causes, evidence), causes, sections, _maps(evidence))
+    return Diagnosis(verdict, summary(verdict, causes, evidence), causes, sections, maps(evidence))
 
 
 def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
@@ -109,6 +107,20 @@ def _undecided(sets: Sequence[Sequence[str]]) -> str:
 def _place(found: SiteFinding) -> str:
     """A site, or the spread of an observation, as text."""
     return f"the spread of {found.site}" if found.family.startswith("spread") else found.site
+
+
+def _tried(evidence: Evidence) -> list[dict[str, Any]]:
+    """The named set and every other one that was fitted in full, the likeliest first; nothing where none was named."""
+    fits = evidence.tried
+    worth = {names: credit(evidence.problem, one.fitted, evidence.base) for names, one in fits.items()}
+    return [
+        {
+            "effects": list(names),
+            "gain_nats": fits[names].fitted.log_evidence - evidence.base.log_evidence,
+            "behind_nats": worth[evidence.accepted] - worth[names],
+        }
+        for names in sorted(fits, key=lambda names: (names != evidence.accepted, -worth[names]))
+    ]
 
 
 def _where(evidence: Evidence) -> dict[str, Any]:
@@ -250,66 +262,6 @@ def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
         change = np.clip(1 - variance * np.maximum(precision, 0.0), 0.0, 1.0)
         result[block.name] = change if len(change) == size else np.full(size, change.mean())
     return result
-
-
-def _maps(evidence: Evidence) -> dict[str, xr.Dataset]:
-    where = {f"gap_{axis}": (axis, values) for axis, values in evidence.before.axes.items()}
-    after = {f"gap_after_{axis}": (axis, values) for axis, values in evidence.after.axes.items()}
-    problem, name = evidence.problem, evidence.problem.cluster_name
-    per = (
-        np.maximum((problem.rows.by_cluster(problem.rows.located) >= 0).sum(1), 1)
-        / problem.rows_per_observation
-    )
-    entropy = -evidence.floor.best / problem.n_observation
-    clusters: dict[str, Any] = {
-        "before": (name, -evidence.held_before.log_likelihood / per - entropy),
-        "after": (name, -evidence.held_after.log_likelihood / per - entropy),
-    }
-    for entry in problem.data.values():
-        for position in ("rx_position", "tx_position"):
-            if hasattr(entry, position) and len(getattr(entry, position)) == problem.n_cluster:
-                clusters[position] = ((name, "direction"), np.asarray(getattr(entry, position)))
-    first = evidence.steps[0].view.screening
-    screening = xr.Dataset(
-        {
-            "z": ("effect", first.z),
-            "p_value": ("effect", first.p_value),
-            "adjusted_p_value": ("effect", first.adjusted),
-            "log_bayes_factor": ("effect", first.log_bayes_factor),
-            "correlation": (("effect", "other_effect"), first.correlation),
-        },
-        coords={"effect": list(first.names), "other_effect": list(first.names)},
-    )
-    group = "links" if name == "link" else "clusters"
-    return {
-        "where": xr.Dataset({**where, **after}),
-        group: xr.Dataset(clusters, attrs={"floor": entropy}),
-        "screening": screening,
-        **_paths(evidence),
-    }
-
-
-def _paths(evidence: Evidence) -> dict[str, xr.Dataset]:
-    """Each path of a traced scene with what it carries of the gap, and where it goes; nothing without a scene."""
-    before, after = (at.entries.get(_PATHS) for at in (evidence.before, evidence.after))
-    traced = next((v for v in evidence.problem.data.values() if hasattr(v, "vertex")), None)
-    if traced is None or before is None or after is None or before.shape != traced.mask.shape:
-        return {}
-    if traced.interaction.size > _MOST_STEPS:
-        return {}
-    steps = ("link", "path", "step")
-    content = {
-        "before": (steps[:2], before),
-        "after": (steps[:2], after),
-        "mask": (steps[:2], np.asarray(traced.mask)),
-        "interaction": (steps, np.asarray(traced.interaction)),
-        "object": (steps, np.asarray(traced.object)),
-        "vertex": ((*steps, "direction"), np.asarray(traced.vertex)),
-        "rx_position": (("link", "direction"), np.asarray(traced.rx_position)),
-        "tx_position": (("link", "direction"), np.asarray(traced.tx_position)),
-        "object_name": (("object_index",), np.array(traced.object_names, str)),
-    }
-    return {"paths": xr.Dataset(content)}
 
 
 def _seed(key: jax.Array) -> int:

@@ -76,3 +76,18 @@ class Evidence:
         for rival in self.rivals:
             found.setdefault(frozenset(rival.fitted.effects), rival)
         return {one.fitted.effects: one for one in found.values()} if self.accepted else {}
+
+    @property
+    def tried(self) -> dict[tuple[str, ...], Start]:
+        """The explanations, and each single effect that was fitted before any was named."""
+        found = self.explanations
+        seen = {frozenset(names) for names in found}
+        first = self.steps[0]
+        if not found or first.view.fitted.effects:
+            return found
+        singles = {fitted.effects: fitted for fitted in first.trials.fits.values()}
+        return found | {
+            names: Start(first.trials.problem, fitted)
+            for names, fitted in singles.items()
+            if frozenset(names) not in seen
+        }

@@ -77,6 +77,14 @@ class Cause(TypedDict):
     plausible: NotRequired[bool]
 
 
+class Tried(TypedDict):
+    """A set that was fitted in full: nats of evidence that it gains, and by which it is less likely than the named one."""
+
+    effects: list[str]
+    gain_nats: float
+    behind_nats: float
+
+
 class Site(TypedDict):
     """A site of the model, with its share of the gap; `family` says how it must change to close it."""
 
@@ -193,6 +201,7 @@ class Report(TypedDict):
     verdict: Verdict
     summary: NotRequired[str]
     causes: list[Cause]
+    tried: NotRequired[list[Tried]]
     where: Where
     gap: Gap
     unlisted: Unlisted

@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from dtprob.report import names, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Candidate, Interval, validate
+from dtprob.report.json_schema import Candidate, Interval, Report, Tried, validate
 from dtprob.report.palette import DARK, LIGHT
 from dtprob.report.story import left_over, next_look, next_step, rivals, tell
 
@@ -52,6 +52,7 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
             story=tell(checked),
             next_step=next_step(checked),
             rivals=rivals(checked),
+            others=others(checked),
             left_over=left_over(checked),
             next_look=next_look(checked),
             charts={section: [chart for name, chart in charts if name == section] for section, _ in charts},
@@ -74,6 +75,17 @@ def bar(size: Interval) -> Bar | None:
     low, span = low - 0.06 * span, 1.12 * span
     place = [round(100 * (value - low) / span, 2) for value in (least, most, mean, 0.0)]
     return Bar(place[0], place[1], place[2], place[3])
+
+
+def others(report: Report) -> list[tuple[Tried, float]]:
+    """The sets that were fitted beside the named one, each with the share of the named one's gain that it has."""
+    tried = report.get("tried", [])
+    if not report["causes"] or not tried:
+        return []
+    named = set(report["causes"][0]["effects"])
+    most = max(next((t["gain_nats"] for t in tried if set(t["effects"]) == named), 0.0), 1e-9)
+    rest = [t for t in tried if set(t["effects"]) != named]
+    return [(t, min(max(t["gain_nats"] / most, 0.0), 1.0)) for t in rest]
 
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -105,6 +117,7 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     units.percent,
     units.chance,
     units.p_value,
+    units.odds,
     units.number,
     names.words,
     names.site_words,

@@ -155,6 +155,18 @@ def chance(probability: float) -> str:
     return "> 99%" if probability > 0.99 else percent(probability)
 
 
+def odds(nats: float) -> str:
+    """By how many times something is less likely that lies behind by so many nats, with one digit, to a million."""
+    if abs(nats) < 0.5:
+        return "as likely"
+    more = "" if nats > 0 else " more likely"
+    if abs(nats) > math.log(1e6):
+        return f"> 10⁶ times{more}"
+    times = math.exp(abs(nats))
+    rounded = number(times, 1) if times < 2 else f"{round(times, -int(math.log10(times))):,.0f}"
+    return f"{rounded} times{more}"
+
+
 def percent(value: float | None) -> str:
     """A share in percent."""
     if value is None:

@@ -136,6 +136,8 @@ def test_two_effects_are_found_one_after_the_other(seed):
     found = run(line, draw("line", seed=20 + seed, shift=shift), key=seed)
     assert found.verdict == "LISTED"
     assert set(found.causes[0].effects) == {"bend", "ripple"}
+    gained = {frozenset(t["effects"]): t["gain_nats"] for t in found.sections["tried"]}
+    assert 0 < gained[frozenset(["bend"])] < gained[frozenset(["bend", "ripple"])]
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -154,6 +156,7 @@ def test_two_names_of_one_rewrite_are_one_class():
     assert set(found.causes[0].alias_class) == {("ripple",), ("twin",)}
     assert abs(found.causes[0].probability - 0.5) < 0.01
     assert found.sections["next_measurement"] is not None
+    assert all(abs(t["behind_nats"]) < 0.01 for t in found.sections["tried"][:2])
     screening = found.maps["screening"]
     assert float(screening.correlation.sel(effect="ripple", other_effect="twin")) > 0.999
 
@@ -294,6 +297,9 @@ def test_the_report_is_plain_and_the_maps_are_named():
     assert report["causes"][0]["closed_fraction"]["mean"] > 0.8
     assert report["gap"]["before"] > report["gap"]["after"]
     assert report["screening"][0]["effect"] == "bend"
+    assert report["tried"][0]["effects"] == ["bend"]
+    assert report["tried"][0]["behind_nats"] == 0.0
+    assert all(t["behind_nats"] > 3 for t in report["tried"][1:])
     assert report["where"]["sites"][0]["site"] == "mean"
     slope = next(n for n in report["fit"]["nuisances"] if n["name"] == "b")
     assert slope["low"] < slope["mean"] < slope["high"]

@@ -87,6 +87,21 @@ def test_several_effects_have_their_shares(examples: dict[str, Any]) -> None:
     assert re.search(r"Timing offset 70% ?60 to 80% 65%", text)
 
 
+def test_what_was_fitted_besides_is_compared_with_the_named_cause(examples: dict[str, Any]) -> None:
+    report = examples["LISTED_WITH_REMAINDER"]()
+    names = report["causes"][0]["effects"]
+    assert "Why not another one" not in Page(render(report, None, title="x")).text
+    report["tried"] = [
+        {"effects": names, "gain_nats": 80.0, "behind_nats": 0.0},
+        {"effects": ["doppler"], "gain_nats": 60.0, "behind_nats": 20.0},
+        {"effects": [*names, "doppler"], "gain_nats": 81.0, "behind_nats": 3.0},
+    ]
+    text = Page(render(report, None, title="x")).text
+    assert "Why not another one" in text
+    assert re.search(r"Doppler 75% ?> 10⁶ times", text)
+    assert re.search(r"and doppler 100% ?20 times", text)
+
+
 def test_summary_of_the_diagnosis_is_the_headline(examples: dict[str, Any]) -> None:
     report = {**examples["UNDETERMINED"](), "summary": "All is <well>."}
     page = render(report, None, title="x")

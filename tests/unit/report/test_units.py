@@ -4,7 +4,17 @@ import math
 
 import pytest
 
-from dtprob.report.units import chance, number, p_value, percent, quantity, reading, scale_for, split_unit
+from dtprob.report.units import (
+    chance,
+    number,
+    odds,
+    p_value,
+    percent,
+    quantity,
+    reading,
+    scale_for,
+    split_unit,
+)
 
 
 @pytest.mark.parametrize(
@@ -75,6 +85,12 @@ def test_probabilities_are_never_rounded_to_certainty() -> None:
         "> 99%",
     ]
     assert [percent(share) for share in (0.0, 0.004, 1.0, -0.1)] == ["0%", "0%", "100%", "−10%"]
+
+
+def test_odds_are_told_with_one_digit() -> None:
+    told = {0.3: "as likely", 0.6: "1.8 times", 2.2: "9 times", 2.25: "9 times", 3.0: "20 times"}
+    told |= {7.2: "1,000 times", -4.0: "50 times more likely", 500.0: "> 10⁶ times"}
+    assert {nats: odds(nats) for nats in told} == told
 
 
 def test_p_values() -> None:

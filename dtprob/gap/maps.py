@@ -1,0 +1,76 @@
+"""The arrays of gap.nc: where the gap lies, in the data's own coordinates."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from dtprob.gap.evidence import Evidence
+
+_PATHS = "path_gain"
+"""The site that has an entry for each path."""
+_MOST_STEPS = 200_000
+"""Steps of paths beyond which a scene is not drawn."""
+
+
+def maps(evidence: Evidence) -> dict[str, xr.Dataset]:
+    """Groups of gap.nc: excess along each axis, loss of each cluster, the screening, and paths where there are any."""
+    where = {f"gap_{axis}": (axis, values) for axis, values in evidence.before.axes.items()}
+    after = {f"gap_after_{axis}": (axis, values) for axis, values in evidence.after.axes.items()}
+    problem, name = evidence.problem, evidence.problem.cluster_name
+    per = (
+        np.maximum((problem.rows.by_cluster(problem.rows.located) >= 0).sum(1), 1)
+        / problem.rows_per_observation
+    )
+    entropy = -evidence.floor.best / problem.n_observation
+    clusters: dict[str, Any] = {
+        "before": (name, -evidence.held_before.log_likelihood / per - entropy),
+        "after": (name, -evidence.held_after.log_likelihood / per - entropy),
+    }
+    for entry in problem.data.values():
+        for position in ("rx_position", "tx_position"):
+            if hasattr(entry, position) and len(getattr(entry, position)) == problem.n_cluster:
+                clusters[position] = ((name, "direction"), np.asarray(getattr(entry, position)))
+    first = evidence.steps[0].view.screening
+    screening = xr.Dataset(
+        {
+            "z": ("effect", first.z),
+            "p_value": ("effect", first.p_value),
+            "adjusted_p_value": ("effect", first.adjusted),
+            "log_bayes_factor": ("effect", first.log_bayes_factor),
+            "correlation": (("effect", "other_effect"), first.correlation),
+        },
+        coords={"effect": list(first.names), "other_effect": list(first.names)},
+    )
+    group = "links" if name == "link" else "clusters"
+    return {
+        "where": xr.Dataset({**where, **after}),
+        group: xr.Dataset(clusters, attrs={"floor": entropy}),
+        "screening": screening,
+        **_paths(evidence),
+    }
+
+
+def _paths(evidence: Evidence) -> dict[str, xr.Dataset]:
+    """Each path of a traced scene with what it carries of the gap, and where it goes; nothing without a scene."""
+    before, after = (at.entries.get(_PATHS) for at in (evidence.before, evidence.after))
+    traced = next((v for v in evidence.problem.data.values() if hasattr(v, "vertex")), None)
+    if traced is None or before is None or after is None or before.shape != traced.mask.shape:
+        return {}
+    if traced.interaction.size > _MOST_STEPS:
+        return {}
+    steps = ("link", "path", "step")
+    content = {
+        "before": (steps[:2], before),
+        "after": (steps[:2], after),
+        "mask": (steps[:2], np.asarray(traced.mask)),
+        "interaction": (steps, np.asarray(traced.interaction)),
+        "object": (steps, np.asarray(traced.object)),
+        "vertex": ((*steps, "direction"), np.asarray(traced.vertex)),
+        "rx_position": (("link", "direction"), np.asarray(traced.rx_position)),
+        "tx_position": (("link", "direction"), np.asarray(traced.tx_position)),
+        "object_name": (("object_index",), np.array(traced.object_names, str)),
+    }
+    return {"paths": xr.Dataset(content)}
