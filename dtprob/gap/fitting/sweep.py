@@ -7,7 +7,7 @@ of trials serves all of them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -23,7 +23,10 @@ _ROUNDS: Final = 2
 _PLACES: Final = 13
 _REACH: Final = 3.0
 _MOST: Final = 4
-"""Pairs of an angle and another coordinate up to which they are looked for together."""
+"""Pairs of an angle and another coordinate up to which they are looked for together; coordinates without an angle."""
+_BEND: Final = 3.0
+"""Nats by which the mean of two places has to lie above the one between them, twice over."""
+_LOWEST: Final = -1e9
 
 
 class _Local(NamedTuple):
@@ -51,6 +54,45 @@ def swept(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) ->
     for other in others:
         for pair in [(turn, other) for turn in turns] or [(other,)]:
             value = _together(problem, x, value, terms, pair)
+    return x
+
+
+def elsewhere(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) -> list[np.ndarray]:
+    """Points at which all clusters have one of their coordinates at the same place, of those that may have several optima.
+
+    Args:
+        problem: the model on its data.
+        x: flat vector; all else stays.
+        terms: of the log posterior.
+    """
+    found = _locals(problem)
+    if len(found) > _MOST or any(one.is_angle for one in found):
+        return []
+    points: list[np.ndarray] = []
+    for one in found:
+        line = []
+        for place in _places(problem, one.name):
+            moved = x.copy()
+            moved[one.positions] = place
+            line.append(moved)
+        if _is_bent(np.stack([np.nan_to_num(terms(point), nan=-np.inf) for point in line])):
+            points += line
+    return points
+
+
+def _is_bent(values: Float[np.ndarray, "place cluster"]) -> bool:
+    """Whether the log posterior of any cluster bends upwards along the places, as no parabola with a peak does."""
+    values = np.maximum(values, _LOWEST)
+    return bool(np.any(values[2:] + values[:-2] - 2 * values[1:-1] > _BEND))
+
+
+def combined(
+    problem: Problem, points: Sequence[np.ndarray], best: Int[np.ndarray, " cluster"]
+) -> Float[np.ndarray, " dimension"]:
+    """The first point, each cluster's own coordinates from the point that is best for it."""
+    x = points[0].copy()
+    for one in _locals(problem):
+        x[one.positions] = np.stack([point[one.positions] for point in points])[best, np.arange(len(best))]
     return x
 
 

@@ -39,7 +39,10 @@ class Compiled:
 
     def terms(self, x: Any, arrays: Arrays) -> Terms:
         """Terms of the log posterior at x, to be traced: derivatives can be taken of it."""
-        found, rows = self._runner.run(x, arrays, {}), {}
+        return self._terms(self._runner.run(x, arrays, {}))
+
+    def _terms(self, found: Outcome) -> Terms:
+        rows = {}
         for name, observed in self._runner.around(found.parameters).items():
             density = whiten.log_prob(observed, found.values[name])
             rows[name] = jnp.zeros(self._runner.shapes[name]).at[0].set(density)
@@ -178,31 +181,23 @@ class Compiled:
         return chunked
 
     @cached_property
-    def shifted_likelihood(self) -> Any:
-        """(x, {site: perturbations (n, *site)}, n) -> log likelihood (n,) of the perturbed model."""
+    def shifted(self) -> Any:
+        """(x, {site: perturbations (n, *site)}, n) -> what clusters add to the log posterior (n, cluster), perturbed."""
 
         @jax.jit
-        def shifted_likelihood(x: Any, deltas: dict[str, jax.Array], count: Any, arrays: Any) -> jax.Array:
+        def shifted(x: Any, deltas: dict[str, jax.Array], count: Any, arrays: Any) -> jax.Array:
             def put(i: Any, into: jax.Array) -> jax.Array:
-                delta = {name: delta[i] for name, delta in deltas.items()}
-                return into.at[i].set(self._likelihood(self._runner.run(x, arrays, delta)))
+                found = self._terms(self._runner.run(x, arrays, {n: delta[i] for n, delta in deltas.items()}))
+                return into.at[i].set(found.likelihood + found.local)
 
-            return jax.lax.fori_loop(0, count, put, jnp.zeros(CHUNK))
+            return jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, self._runner.rows.n_cluster)))
 
         def chunked(x: np.ndarray, deltas: Mapping[str, Any], n: int) -> np.ndarray:
             chunks = zip(range(n, 0, -CHUNK), self._padded(deltas, n), strict=True)
-            parts = [
-                shifted_likelihood(jnp.asarray(x), chunk, min(left, CHUNK), self.arrays)
-                for left, chunk in chunks
-            ]
+            parts = [shifted(jnp.asarray(x), chunk, min(left, CHUNK), self.arrays) for left, chunk in chunks]
             return np.concatenate([np.asarray(part) for part in parts])[:n]
 
         return chunked
-
-    def _likelihood(self, found: Outcome) -> jax.Array:
-        """Log likelihood of all data."""
-        observed = self._runner.around(found.parameters).items()
-        return jnp.sum(jnp.stack([jnp.sum(whiten.log_prob(o, found.values[n])) for n, o in observed]))
 
     def _padded(self, deltas: Mapping[str, Any], n: int) -> Iterator[dict[str, jax.Array]]:
         """Perturbations of all sites in chunks of one size, zero where none is given."""

@@ -2,7 +2,9 @@
 
 Every effect is tried at four sizes; where the log likelihood is not the parabola that its first two sizes promise, the
 effect is scanned over its whole plausible range. The rewritten sites go through the base model as perturbations, so no
-candidate needs a compilation of its own.
+candidate needs a compilation of its own. Where clusters have coordinates of their own with several optima (a link's delay
+where only powers are seen), large sizes are tried with these found anew: a swap of two transmitters explains nothing
+while delays stand where the wrong one put them.
 """
 
 from __future__ import annotations
@@ -15,6 +17,7 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.plausible import nulls, scales, sides
+from dtprob.gap.fitting.sweep import combined, elsewhere
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.directions import Surroundings, surroundings
 
@@ -26,6 +29,8 @@ _SMALL, _LARGE = 0.02, 1.0
 _BENT = 0.4
 _DRAWS = 64
 _STEPS = 21
+_FAR = np.array([-2.0, -1.4, -0.7, 0.7, 1.4, 2.0])
+"""Sizes that are tried with clusters' own coordinates found anew, in standard deviations of the prior."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +58,7 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
     found: dict[str, Found] = {}
     for anchor in (x, centre(problem, x)):
         around = surroundings(problem, anchor)
-        here = float(problem.compiled.shifted_likelihood(anchor, {}, 1)[0])
+        here = float(problem.compiled.shifted(anchor, {}, 1)[0].sum())
         probed = _likelihoods(problem, around, small)
         bent = [e for e in means if _is_bent(probed[e.name] - here)]
         lines, likelihoods = _scanned(problem, around, bent, _COARSE)
@@ -65,6 +70,26 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
             gain = float(values[best]) - here
             if name not in found or gain > found[name].gain:
                 found[name] = Found(gain, anchor, lines[name][best])
+    for name, one in _found_anew(problem, x, means).items():
+        if name not in found or one.gain > found[name].gain:
+            found[name] = one
+    return found
+
+
+def _found_anew(problem: Problem, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, Found]:
+    """Each effect at its best large size with clusters' own coordinates where they are best then; see `elsewhere`."""
+    others = elsewhere(problem, x, problem.compiled.by_cluster)
+    if not others:
+        return {}
+    points, lines = [x, *others], {e.name: _lines(e, _FAR) for e in effects}
+    here = float(np.stack([problem.compiled.by_cluster(point) for point in points]).max(axis=0).sum())
+    each = [_terms(problem, surroundings(problem, point), lines) for point in points]
+    found = {}
+    for name, line in lines.items():
+        terms = np.stack([one[name] for one in each])
+        best = int(np.argmax(terms.max(axis=0).sum(axis=1)))
+        gain = float(terms[:, best].max(axis=0).sum()) - here
+        found[name] = Found(gain, combined(problem, points, terms[:, best].argmax(axis=0)), line[best])
     return found
 
 
@@ -119,10 +144,15 @@ def _lines(effect: Effect, offsets: np.ndarray) -> np.ndarray:
 def _likelihoods(
     problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    found = {name: np.full(len(rows), -np.inf) for name, rows in sizes.items()}
+    return {name: terms.sum(axis=1) for name, terms in _terms(problem, around, sizes).items()}
+
+
+def _terms(problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """What clusters add to the log posterior (trial, cluster) at sizes of each effect; what is not finite is -inf."""
+    found = {name: np.full((len(rows), problem.n_cluster), -np.inf) for name, rows in sizes.items()}
     for name, part, shifts in problem.programs.trial_shifts(around.grown(), sizes):
-        count = part.stop - part.start
-        found[name][part] = problem.compiled.shifted_likelihood(around.x, shifts, count)
+        values = problem.compiled.shifted(around.x, shifts, part.stop - part.start)
+        found[name][part] = np.nan_to_num(values, nan=-np.inf, posinf=-np.inf)
     return found
 
 

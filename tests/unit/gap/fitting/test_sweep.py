@@ -15,6 +15,8 @@ from dtprob.gap.fitting.refit import starting_points
 from dtprob.gap.fitting.sweep import swept, turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
+from dtprob.gap.which import scan as scan_module
+from dtprob.gap.which.scan import scan
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
 
@@ -23,6 +25,7 @@ LATE = np.array([-1.6, -0.7, 0.0, 0.9, 1.7])
 PHASE = np.array([0.3, -2.0, 1.0, 2.9, -0.6])
 NOISE = 0.1
 TAPS = np.linspace(-3.0, 3.0, 31)
+PULSES = np.array([-0.6, 0.0, 1.0, 2.2])
 BEND = Effect(
     "bend", {"level": lambda value, p, _: value + p["by"]}, (Parameter("by", dist.Normal(0.0, 1.0)),)
 )
@@ -111,6 +114,50 @@ def test_a_place_without_an_angle_is_looked_for_too():
     stuck = fitting.fit(problem, problem.start({"late": np.zeros((5, 1))}))
     assert np.abs(places(problem, stuck.x) - LATE).max() > 0.3
     np.testing.assert_allclose(places(problem, settled(problem, stuck).x), LATE, atol=0.1)
+
+
+@model(cluster="link", axes={"amplitude": ("pulse",), "power": ("link", "tap")})
+def two_places(links, y=None):
+    """Each link has two pulses; those of another place could stand there instead."""
+    amplitude = numpyro.deterministic("amplitude", jnp.array([1.0, 1.0, 0.0, 0.0]))
+    with numpyro.plate("link", links, dim=-2):
+        late = numpyro.sample("late", dist.Normal(0.0, 1.0))
+        apart = (TAPS - late)[..., None] - PULSES
+        power = numpyro.deterministic("power", jnp.exp(-0.5 * (apart / 0.2) ** 2) @ amplitude)
+        with numpyro.plate("tap", len(TAPS), dim=-1):
+            numpyro.sample("y", dist.Normal(power, NOISE), obs=y)
+
+
+def test_what_needs_the_links_found_anew_is_seen_by_the_scan(monkeypatch):
+    late = LATE / 4
+    noise = NOISE * np.random.default_rng(4).normal(size=(len(late), len(TAPS)))
+    power = np.exp(-0.5 * ((TAPS - late[:, None] - PULSES[2:, None, None]) / 0.2) ** 2).sum(0)
+    swap = Effect(
+        "swap",
+        {"amplitude": lambda value, p, _: value + p["share"] * (value[::-1] - value)},
+        (Parameter("share", dist.Normal(0.0, 0.7)),),
+    )
+    problem = Problem(two_places, {"links": len(late), "y": jnp.asarray(power + noise)}, [swap])
+    fitted = settled(problem, fitting.fit(problem, problem.start({"late": np.zeros((5, 1))})))
+    assert np.abs(places(problem, fitted.x) - late).max() > 0.5
+    found = scan(problem, fitted.x, ["swap"])["swap"]
+    assert found.gain > 100
+    assert np.isclose(found.parameters[0], 0.98)
+    assert np.sum(np.abs(places(problem, found.x) - late) < 0.3) >= 4  # trial places are far apart
+    held = scan_module.elsewhere
+    monkeypatch.setattr(scan_module, "elsewhere", lambda *_: [])
+    assert "swap" not in scan(problem, fitted.x, ["swap"])
+    linear = Problem(levels, {"y": jnp.asarray(power)}, [])
+    assert held(linear, linear.start({"level": np.zeros((5, 1))}), linear.compiled.by_cluster) == []
+
+
+@model(cluster="link")
+def levels(y=None):
+    """A level for each link, with one optimum."""
+    with numpyro.plate("link", len(LATE), dim=-2):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("tap", len(TAPS), dim=-1):
+            numpyro.sample("y", dist.Normal(level, NOISE), obs=y)
 
 
 def test_large_sizes_are_tried_with_the_links_found_anew(problem):
