@@ -23,14 +23,12 @@ from dtprob.raytracing.beyond import strongest, with_beyond
 from dtprob.raytracing.paths import PathSet
 
 _WALL_THICKNESS = 0.12
-_MOST_ELSEWHERE = 4
-"""The same from another transmitter's place."""
-_OTHER_DEPTH = 2
-"""Most interactions on paths from another transmitter's place."""
 _APART = 1e-2
 """Ends closer than this, in m, cannot be traced."""
 _MOST_BEYOND = 64
 """Paths of another trace that are kept for each link where the case does not say."""
+_MOST_ELSEWHERE = 8
+"""The same from another transmitter's place."""
 
 
 def reached[Links: ChannelData | PowerData](
@@ -147,8 +145,8 @@ def _trace(scene: SceneSection, data: ChannelData | PowerData) -> PathSet:
         fuller[REFRACTION] = traced.paths(scene.max_depth, refraction=True)
     if scene.check_transmitters:
         for number, place in enumerate(np.unique(data.tx_position, axis=0)):
-            depth = min(scene.max_depth, _OTHER_DEPTH)
-            fuller[place_name(number)] = traced.paths(depth, refraction=scene.refraction, source=place)
+            elsewhere = traced.paths(scene.max_depth, refraction=scene.refraction, source=place)
+            fuller[place_name(number)] = elsewhere
     known = paths
     paths = paths if scene.strongest is None else strongest(paths, scene.strongest)
     for name, other in fuller.items():
