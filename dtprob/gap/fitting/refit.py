@@ -10,7 +10,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import local_maxima, polish
 from dtprob.gap.fitting.marginal import settled
-from dtprob.gap.fitting.plausible import nulls, places, scales, sides
+from dtprob.gap.fitting.plausible import LARGE, nulls, places, scales, sides
 from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -21,8 +21,6 @@ _BETTER = 0.5
 """Nats by which another optimum has to be higher."""
 _SWEPT = 3
 """Parameters of an effect whose large sizes are tried with the clusters' angles found anew."""
-_LARGE = np.array([-2.0, -1.4, -0.7, 0.7, 1.4, 2.0])
-"""These sizes, in standard deviations of the prior."""
 _REACH = 0.4
 """Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
@@ -158,7 +156,7 @@ def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[
     scale, sided = scales(effect), sides(effect)
     found: list[tuple[float, np.ndarray]] = []
     for j, position in enumerate(index[:_SWEPT]):
-        for size in _LARGE[_LARGE > 0] if sided[j] else _LARGE:
+        for size in LARGE[LARGE > 0] if sided[j] else LARGE:
             moved = x.copy()
             moved[position] += size * scale[j]
             start = swept(problem, moved, problem.compiled.by_cluster)

@@ -9,14 +9,14 @@ while delays stand where the wrong one put them.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
 import numpy as np
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import nulls, scales, sides
+from dtprob.gap.fitting.plausible import LARGE, nulls, scales, sides
 from dtprob.gap.fitting.sweep import combined, elsewhere
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.directions import Surroundings, surroundings
@@ -29,8 +29,6 @@ _SMALL, _LARGE = 0.02, 1.0
 _BENT = 0.4
 _DRAWS = 64
 _STEPS = 21
-_FAR = np.array([-2.0, -1.4, -0.7, 0.7, 1.4, 2.0])
-"""Sizes that are tried with clusters' own coordinates found anew, in standard deviations of the prior."""
 
 
 @dataclass(frozen=True)
@@ -77,19 +75,27 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
 
 
 def _found_anew(problem: Problem, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, Found]:
-    """Each effect at its best large size with clusters' own coordinates where they are best then; see `elsewhere`."""
+    """Effects that gain at a large size with clusters' own coordinates where they are best then; see `elsewhere`."""
     others = elsewhere(problem, x, problem.compiled.by_cluster)
     if not others:
         return {}
-    points, lines = [x, *others], {e.name: _lines(e, _FAR) for e in effects}
-    here = float(np.stack([problem.compiled.by_cluster(point) for point in points]).max(axis=0).sum())
-    each = [_terms(problem, surroundings(problem, point), lines) for point in points]
+    points = [x, *others]
+    lines = {e.name: _lines(e, LARGE[LARGE > 0] if sides(e).all() else LARGE) for e in effects}
+    best = {name: np.full((len(line), problem.n_cluster), -np.inf) for name, line in lines.items()}
+    chosen = {name: np.zeros(terms.shape, int) for name, terms in best.items()}
+    here = np.full(problem.n_cluster, -np.inf)
+    for i, point in enumerate(points):
+        here = np.fmax(here, problem.compiled.by_cluster(point))
+        for name, part, terms in _terms(problem, surroundings(problem, point), lines):
+            chosen[name][part] = np.where(terms > best[name][part], i, chosen[name][part])
+            best[name][part] = np.maximum(terms, best[name][part])
     found = {}
     for name, line in lines.items():
-        terms = np.stack([one[name] for one in each])
-        best = int(np.argmax(terms.max(axis=0).sum(axis=1)))
-        gain = float(terms[:, best].max(axis=0).sum()) - here
-        found[name] = Found(gain, combined(problem, points, terms[:, best].argmax(axis=0)), line[best])
+        total = best[name].sum(axis=1)
+        k = int(np.argmax(total))
+        if total[k] > here.sum():
+            x_there = combined(problem, points, chosen[name][k])
+            found[name] = Found(float(total[k] - here.sum()), x_there, line[k])
     return found
 
 
@@ -144,16 +150,19 @@ def _lines(effect: Effect, offsets: np.ndarray) -> np.ndarray:
 def _likelihoods(
     problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    return {name: terms.sum(axis=1) for name, terms in _terms(problem, around, sizes).items()}
+    found = {name: np.full(len(rows), -np.inf) for name, rows in sizes.items()}
+    for name, part, terms in _terms(problem, around, sizes):
+        found[name][part] = terms.sum(axis=1)
+    return found
 
 
-def _terms(problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """What clusters add to the log posterior (trial, cluster) at sizes of each effect; what is not finite is -inf."""
-    found = {name: np.full((len(rows), problem.n_cluster), -np.inf) for name, rows in sizes.items()}
+def _terms(
+    problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]
+) -> Iterator[tuple[str, slice, np.ndarray]]:
+    """What clusters add to the log posterior (trial, cluster) at some trials of an effect; what is not finite is -inf."""
     for name, part, shifts in problem.programs.trial_shifts(around.grown(), sizes):
         values = problem.compiled.shifted(around.x, shifts, part.stop - part.start)
-        found[name][part] = np.nan_to_num(values, nan=-np.inf, posinf=-np.inf)
-    return found
+        yield name, part, np.nan_to_num(values, nan=-np.inf, posinf=-np.inf)
 
 
 def _is_bent(change: np.ndarray) -> bool:

@@ -142,7 +142,7 @@ def test_what_needs_the_links_found_anew_is_seen_by_the_scan(monkeypatch):
     assert np.abs(places(problem, fitted.x) - late).max() > 0.5
     found = scan(problem, fitted.x, ["swap"])["swap"]
     assert found.gain > 100
-    assert np.isclose(found.parameters[0], 0.98)
+    assert np.isclose(found.parameters[0], 1.0)
     assert np.sum(np.abs(places(problem, found.x) - late) < 0.3) >= 4  # trial places are far apart
     held = scan_module.elsewhere
     monkeypatch.setattr(scan_module, "elsewhere", lambda *_: [])
