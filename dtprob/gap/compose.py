@@ -110,8 +110,8 @@ def _place(found: SiteFinding) -> str:
 
 
 def _tried(evidence: Evidence) -> list[dict[str, Any]]:
-    """The named set and every other one that was fitted in full, the likeliest first; nothing where none was named."""
-    fits = evidence.tried
+    """The named set and others that were fitted in full, the likeliest first; nothing where none was named."""
+    fits = {n: one for n, one in evidence.tried.items() if np.isfinite(one.fitted.log_evidence)}
     worth = {names: credit(evidence.problem, one.fitted, evidence.base) for names, one in fits.items()}
     return [
         {

@@ -75,7 +75,7 @@ class Diagnosis:
         return plain(report)
 
     def to_datatree(self) -> xr.DataTree:
-        """The content of gap.nc: groups where, links or clusters, screening."""
+        """The content of gap.nc: groups where, differences, links or clusters, screening, paths."""
         return xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in self.maps.items()})
 
 

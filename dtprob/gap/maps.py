@@ -11,6 +11,8 @@ from dtprob.gap.evidence import Evidence
 
 _PATHS = "path_gain"
 """The site that has an entry for each path."""
+_COLUMNS = 6
+"""Columns along which differences are kept, those that stand out most."""
 _MOST_STEPS = 200_000
 """Steps of paths beyond which a scene is not drawn."""
 
@@ -49,8 +51,26 @@ def maps(evidence: Evidence) -> dict[str, xr.Dataset]:
         "where": xr.Dataset({**where, **after}),
         group: xr.Dataset(clusters, attrs={"floor": entropy}),
         "screening": screening,
+        **_differences(evidence),
         **_paths(evidence),
     }
+
+
+def _differences(evidence: Evidence) -> dict[str, xr.Dataset]:
+    """Data less twin along each column, before and after, and its spread where the twin is right."""
+    after = {(d.observed, d.axis, d.column): d for d in evidence.after.differences}
+    looked_at = sum(len(d.place) for d in evidence.before.differences)
+    content: dict[str, Any] = {}
+    for i, before in enumerate(evidence.before.differences[:_COLUMNS]):
+        group = f"group_{i}"
+        said = {"observed": before.observed, "column": before.column, "unit": before.unit, "of": looked_at}
+        content[f"place_{i}"] = (group, before.place, said)
+        content[f"before_{i}"] = (group, before.mean, said)
+        content[f"spread_{i}"] = (group, before.spread, said)
+        then = after.get((before.observed, before.axis, before.column))
+        if then is not None and np.array_equal(then.place, before.place):
+            content[f"after_{i}"] = (group, then.mean, said)
+    return {"differences": xr.Dataset(content)} if content else {}
 
 
 def _paths(evidence: Evidence) -> dict[str, xr.Dataset]:

@@ -106,6 +106,34 @@ def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     return [_coordinate_chart(data, axis, quiet=quiet, named=axis in named) for axis in ordered[:_MOST_MAPS]]
 
 
+def difference_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
+    """Data less twin along each column of the data, in their own unit, with its sign."""
+    data = _group(gap, "differences", report)
+    return [_difference_chart(data, i) for i in range(len(data.dims))]
+
+
+def _difference_chart(data: xr.Dataset, index: int) -> Chart:
+    place, before, spread = (data[f"{name}_{index}"].values for name in ("place", "before", "spread"))
+    after, said = data.get(f"after_{index}"), data[f"place_{index}"].attrs
+    name, unit = capital(words(str(said["column"]))), said["unit"]
+    limit = usual_limit(int(said["of"])) * spread
+    figure = coordinate_map(
+        place,
+        before,
+        None if after is None else after.values,
+        label=name,
+        threshold=limit,
+        amount=f"Data less twin ({unit})" if unit else "Data less twin",
+    )
+    far = int(np.argmax(np.abs(before) - limit))
+    caption = (
+        f"{name}: above 0 the data ({words(str(said['observed']))}) are larger than the twin says, on average. "
+        "Grey: where all values along all columns stay, in 95 of 100 cases, when the twin is right."
+    )
+    most = f"{number(float(before[far]))} at {number(float(place[far]))}"
+    return Chart(inline_svg(figure, f"Data less twin along {words(str(said['column']))}: {most}."), caption)
+
+
 def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     """The links seen from above, before and after, in the same colours."""
     data = _group(gap, "links", report)
@@ -243,6 +271,7 @@ def _plan_alt(value: xr.DataArray, rx_position: np.ndarray, name: str) -> str:
 def all_charts(report: Report, gap: xr.DataTree | None) -> Iterator[tuple[str, Chart]]:
     """Every figure of the page with the section it belongs to."""
     yield from (("coordinates", chart) for chart in coordinate_charts(report, gap))
+    yield from (("differences", chart) for chart in difference_charts(report, gap))
     if report["verdict"] == "NO_GAP":  # bars and colours would make noise look like a finding
         return
     yield from (("plan", chart) for chart in plan_charts(report, gap))

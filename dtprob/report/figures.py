@@ -155,22 +155,27 @@ def coordinate_map(
     after: ArrayLike | None = None,
     *,
     label: str,
-    threshold: float,
+    threshold: float | Float[np.ndarray, " coordinate"],
+    amount: str = "Excess (std. dev.)",
 ) -> Figure:
-    """Standardised excess energy over one coordinate of the data, before and after the accepted effect.
+    """A misfit over one coordinate of the data, before and after the accepted effect.
 
     Args:
         coordinate: (coordinate,) numbers, or names.
-        before: (coordinate,) excess of the twin as it is, in standard deviations.
+        before: (coordinate,) misfit of the twin as it is.
         after: (coordinate,) the same with the accepted effect.
         label: name and unit of the coordinate.
         threshold: all values stay within +-threshold in 95 of 100 data sets when the twin is right; see `usual_limit`.
+        amount: what is drawn, with its unit.
     """
     names = np.asarray(coordinate)
     place = names if np.issubdtype(names.dtype, np.number) else np.arange(names.size)
     with mpl.rc_context(STYLE):
         figure, axes = _figure(2.7)
-        axes.axhspan(-threshold, threshold, color=LIGHT["floor"], linewidth=0)
+        if isinstance(threshold, np.ndarray):
+            axes.fill_between(place, -threshold, threshold, color=LIGHT["floor"], linewidth=0)
+        else:
+            axes.axhspan(-threshold, threshold, color=LIGHT["floor"], linewidth=0)
         marker = names.size <= 48
         for value, name, shape in ((before, "before", "s"), (after, "after", "o")):
             if value is not None:
@@ -183,15 +188,16 @@ def coordinate_map(
             axes.set_xticks(place, [str(name) for name in names], rotation=0 if names.size <= 6 else 45)
         elif names.size <= 10:
             axes.set_xticks(place)
-        axes.yaxis.set_major_locator(MaxNLocator(5, integer=True))
-        if max(np.max(np.abs(np.asarray(before))), threshold) > 40 * threshold:
-            axes.set_yscale("symlog", linthresh=threshold)
+        axes.yaxis.set_major_locator(MaxNLocator(5))
+        limit = float(np.max(threshold))
+        if max(np.max(np.abs(np.asarray(before))), limit) > 40 * limit:
+            axes.set_yscale("symlog", linthresh=limit)
         if after is not None:
             axes.legend(
                 loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=2, labelcolor="linecolor", borderpad=0
             )
         axes.set_xlabel(label)
-        axes.set_ylabel("Excess (std. dev.)")
+        axes.set_ylabel(amount)
         return figure
 
 

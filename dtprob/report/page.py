@@ -78,13 +78,17 @@ def bar(size: Interval) -> Bar | None:
 
 
 def others(report: Report) -> list[tuple[Tried, float]]:
-    """The sets that were fitted beside the named one, each with the share of the named one's gain that it has."""
+    """The sets that were fitted beside the named one, each with the share of the named one's gain that it has.
+
+    None where no cause is named; those that are just as possible are told as such.
+    """
     tried = report.get("tried", [])
-    if not report["causes"] or not tried:
+    if report["verdict"] not in {"LISTED", "LISTED_WITH_REMAINDER"} or not tried:
         return []
     named = set(report["causes"][0]["effects"])
+    possible = [named, *map(set, report["causes"][0]["alias_class"])]
     most = max(next((t["gain_nats"] for t in tried if set(t["effects"]) == named), 0.0), 1e-9)
-    rest = [t for t in tried if set(t["effects"]) != named]
+    rest = [t for t in tried if set(t["effects"]) not in possible]
     return [(t, min(max(t["gain_nats"] / most, 0.0), 1.0)) for t in rest]
 
 

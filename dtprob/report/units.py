@@ -156,7 +156,7 @@ def chance(probability: float) -> str:
 
 
 def odds(nats: float) -> str:
-    """By how many times something is less likely that lies behind by so many nats, with one digit, to a million."""
+    """By how many times something is less likely that lies behind by so many nats, to a million."""
     if abs(nats) < 0.5:
         return "as likely"
     more = "" if nats > 0 else " more likely"

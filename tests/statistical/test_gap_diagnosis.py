@@ -305,7 +305,11 @@ def test_the_report_is_plain_and_the_maps_are_named():
     assert slope["low"] < slope["mean"] < slope["high"]
     assert 0.9 < slope["contraction"] <= 1.0
     tree = found.to_datatree()
-    assert {"where", "links", "screening"} <= set(tree.children)
+    assert {"where", "links", "screening", "differences"} <= set(tree.children)
+    shown = tree["differences"]
+    limit = 4 * shown["spread_0"].values
+    assert np.any(np.abs(shown["before_0"].values) > limit)
+    assert np.all(np.abs(shown["after_0"].values) < limit)
     assert tree["links"].sizes["link"] == 12
 
 

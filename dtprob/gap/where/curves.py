@@ -136,16 +136,16 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     place = (np.arange(size) + 0.5) / size
     yield Curves(f"smooth in {axis}", _waves(place, 1, _ORDER))
     yield from _ripples(axis, place, _FINEST)
-    columns = _columns(problem, axis, size)
-    for name, column in columns.items():
+    found = columns(problem, axis, size)
+    for name, column in found.items():
         groups, index = np.unique(column, return_inverse=True)
         if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
             yield from _over(name, column, _FINEST)
         else:
             yield Curves(f"by {name}", _grouped(index), column=name)
-    smooth = [name for name, column in columns.items() if np.issubdtype(column.dtype, np.floating)]
+    smooth = [name for name, column in found.items() if np.issubdtype(column.dtype, np.floating)]
     for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
-        crossed = _waves(_rank(columns[one]), 1, _CROSSED), _waves(_rank(columns[other]), 1, _CROSSED)
+        crossed = _waves(_rank(found[one]), 1, _CROSSED), _waves(_rank(found[other]), 1, _CROSSED)
         products = crossed[0][:, None] * crossed[1][None]
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
 
@@ -204,7 +204,7 @@ def _rank(column: np.ndarray) -> np.ndarray:
     return (stats.rankdata(column) - 0.5) / len(column)
 
 
-def _columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
+def columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
     """Columns of the data (size,) that lie along an axis of the observations and vary; of positions each coordinate."""
     observed = problem.declaration.observed.values()
     if not any(axis in site.axes for site in observed):

@@ -23,6 +23,7 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.where.curves import Quantity, curves, quantity
+from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.suspects import Suspect, suspects
@@ -65,6 +66,7 @@ class Location:
     site_p_value: float
     suspects: tuple[Suspect, ...] = ()
     entries: Mapping[str, np.ndarray] = MappingProxyType({})
+    differences: tuple[Differences, ...] = ()
 
 
 NOWHERE: Final = Location((), (), {}, 1.0)
@@ -85,7 +87,8 @@ def locate(
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
     entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
     ordered = tuple(sorted(_spreads_last(seen.findings), key=lambda f: (f.last, f.p_value, -f.gain)))
-    return Location(ordered, blocks, maps, seen.p_value, suspected, entries)
+    strays = differences(problem, drawn)
+    return Location(ordered, blocks, maps, seen.p_value, suspected, entries, strays)
 
 
 class _Tested(NamedTuple):
