@@ -7,19 +7,22 @@ first order. The spread of a mean is that of the drawn data.
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
-from scipy import stats
+from scipy import sparse, stats
 
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
 from dtprob.gap.where.curves import columns
 from dtprob.gap.where.families import by_observation
+from dtprob.models.declaration import Site
 
 _FEWEST: Final = 4
 _MOST: Final = 24
@@ -37,7 +40,7 @@ class Differences:
 
     Attributes:
         observed: the observed site.
-        axis: of the site, along which the column lies.
+        axis: of the site, along which the column lies; "" where it has an entry for each observation.
         column: of the data.
         unit: "dB" of log-normal observations, else "", the unit of the data.
         place: median of the column in each group.
@@ -60,7 +63,7 @@ class Differences:
 
 
 class _Strays(NamedTuple):
-    """Weighted rows (1 + replicate, position) of an observed site along an axis, and their weights (position,)."""
+    """Weighted rows (1 + replicate, position) of an observed site along an axis, or of each entry; weights (position,)."""
 
     observed: str
     axis: str
@@ -68,12 +71,16 @@ class _Strays(NamedTuple):
     rows: np.ndarray
     known: np.ndarray
 
-    def along(self, column: str, values: np.ndarray) -> Differences:
+    def over(self, found: Mapping[str, np.ndarray]) -> list[Differences]:
+        """The differences along columns that tell something."""
+        return [self._along(name, values.reshape(-1)) for name, values in found.items() if _is_told(values)]
+
+    def _along(self, column: str, values: np.ndarray) -> Differences:
         """The differences in groups of a column (position,), without those where nothing is seen or the fit takes all."""
         group = _groups(values)
-        member = np.eye(group.max() + 1)[group]
-        weight = self.known @ member
-        mean = self.rows @ member / np.where(weight > 0, weight, np.inf)
+        member = sparse.csr_matrix((np.ones(len(group)), (group, np.arange(len(group)))))
+        weight = member @ self.known
+        mean = (member @ self.rows.T).T / np.where(weight > 0, weight, np.inf)
         spread = mean[1:].std(axis=0)
         told = spread * np.sqrt(weight) > _NOTHING
         place = np.array([np.median(values[group == g]) for g in range(len(weight))])
@@ -96,19 +103,17 @@ def differences(problem: Problem, drawn: Replicates) -> tuple[Differences, ...]:
         site, weight = problem.declaration.observed[name], weights[name]
         if weight is None:
             continue
+        unit, weighted, known = (
+            "dB" if around[name].family == "LogNormal" else "",
+            rows[:, 0] * weight,
+            weight**2,
+        )
+        whole = _Strays(name, "", unit, weighted.reshape(len(weighted), -1), known.reshape(-1))
+        found += whole.over(_of_each(problem, drawn.fitted.x, site))
         for i, axis in enumerate(site.axes):
             rest = tuple(j for j in range(len(site.shape)) if j != i)
-            strays = _Strays(
-                name,
-                axis,
-                "dB" if around[name].family == "LogNormal" else "",
-                (rows[:, 0] * weight).sum(axis=tuple(j + 1 for j in rest)),
-                (weight**2).sum(axis=rest),
-            )
-            along = columns(problem, axis, site.shape[i])
-            if len(site.shape) == 1:
-                along = along | _computed(problem, drawn.fitted.x, site.shape)
-            found += [strays.along(column, values) for column, values in along.items() if _is_told(values)]
+            summed = weighted.sum(axis=tuple(j + 1 for j in rest)), known.sum(axis=rest)
+            found += _Strays(name, axis, unit, *summed).over(columns(problem, axis, site.shape[i]))
     return tuple(sorted((d for d in found if len(d.place) > 1), key=lambda d: -d.largest))
 
 
@@ -121,19 +126,25 @@ def _rows_per_unit(observed: whiten.Observation) -> np.ndarray | None:
     return moved / _DECIBELS if observed.family == "LogNormal" else moved
 
 
-def _computed(problem: Problem, x: np.ndarray, shape: tuple[int, ...]) -> dict[str, np.ndarray]:
-    """What the model computes for each observation from the data alone, such as a distance."""
+def _of_each(problem: Problem, x: np.ndarray, site: Site) -> dict[str, np.ndarray]:
+    """What has an entry for each observation: data, and what the model computes from them alone, as a distance."""
     here, there = problem.compiled.sites(x), problem.compiled.sites(problem.null())
-    sites = {name: np.asarray(here[name]) for name in problem.float_sites if name in here}
-    return {
-        name: values
-        for name, values in sites.items()
-        if values.shape == shape and not np.iscomplexobj(values) and np.array_equal(values, there[name])
+    found = {
+        n: np.asarray(here[n]) for n in problem.float_sites if n in here and np.array_equal(here[n], there[n])
     }
+    if len(site.shape) > 1:
+        found |= {
+            name: np.asarray(column)
+            for name, column in problem.data.items()
+            if name != site.argument and eqx.is_array_like(column)
+        }
+    return {n: v for n, v in found.items() if v.shape == site.shape and not np.iscomplexobj(v)}
 
 
 def _is_told(values: np.ndarray) -> bool:
     """Whether groups of a column tell something: finite numbers that vary."""
+    if not (np.issubdtype(values.dtype, np.number) or values.dtype == bool):
+        return False
     return bool(np.isfinite(values).all()) and np.ptp(values.astype(float)) > 0
 
 
