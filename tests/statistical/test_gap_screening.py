@@ -163,15 +163,15 @@ def test_a_second_look_at_the_sites_is_of_new_replicates(problem):
     data = draw("line", seed=3)
     fitted, _, drawn, _ = look(problem, data)
     again = more(drawn, 5)
-    assert len(again.projected) == 5 * len(drawn.projected)
+    assert again.at_sites == 5 * drawn.at_sites
     assert {n: len(g) for n, g in again.gradients.items()} == dict.fromkeys(
-        drawn.gradients, 1 + len(again.projected)
+        drawn.gradients, 1 + again.at_sites
     )
     for name, gradient in again.gradients.items():
         np.testing.assert_array_equal(gradient[0], drawn.gradients[name][0])
-        own = problem.compiled.site_gradient(fitted.x, again.projected[-1:])[name]
+        own = problem.compiled.site_gradient(fitted.x, again.rows[-1:])[name]
         np.testing.assert_allclose(gradient[-1], own[0], rtol=1e-6, atol=1e-12)
-    alike = np.asarray(again.projected)[:, None] == np.asarray(drawn.projected)[None]
+    alike = again.rows[1:, None] == drawn.rows[None, 1:]
     assert not alike.all(axis=(2, 3)).any()
 
 

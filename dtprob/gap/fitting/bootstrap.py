@@ -29,9 +29,8 @@ class Replicates:
         problem, fitted, projection: where they are drawn.
         keys: one per replicate.
         raw: rows of the data (cluster, row), as if nothing had been fitted.
-        observed: projected rows of the data (cluster, row).
-        projected: projected rows of the first replicates (replicate, cluster, row).
-        gradients: site gradients of the data and of the first replicates, (1 + replicate, *site) by site.
+        rows: projected rows of the data and of the first replicates (1 + replicate, cluster, row).
+        gradients: site gradients of the same, (1 + replicate, *site) by site.
     """
 
     problem: Problem
@@ -39,9 +38,13 @@ class Replicates:
     projection: Projection
     keys: jax.Array
     raw: np.ndarray
-    observed: np.ndarray
-    projected: np.ndarray
+    rows: np.ndarray
     gradients: Mapping[str, jax.Array]
+
+    @property
+    def at_sites(self) -> int:
+        """Number of replicates that are taken to the sites."""
+        return len(self.rows) - 1
 
     def portions(self) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
         """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
@@ -63,8 +66,9 @@ def replicate(
     keys = jax.random.split(key, settings.replicates)
     raw, observed = observed_rows(problem, fitted, projection)
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
-    gradients = problem.compiled.site_gradient(fitted.x, np.concatenate([observed[None], projected]))
-    return Replicates(problem, fitted, projection, keys, raw, observed, projected, gradients)
+    rows = np.concatenate([observed[None], projected])
+    gradients = problem.compiled.site_gradient(fitted.x, rows)
+    return Replicates(problem, fitted, projection, keys, raw, rows, gradients)
 
 
 def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
@@ -80,23 +84,23 @@ def more(drawn: Replicates, times: int) -> Replicates | None:
         drawn: a first look at the same fit.
         times: how many more.
     """
-    first = len(drawn.projected)
+    first = drawn.at_sites
     entries = sum(g[0].size for g in drawn.gradients.values())
     times = int(min(_MOST_VALUES / (first * max(entries, 1)), times))
     if times < 2:
         return None
     keys = jax.random.split(jax.random.fold_in(drawn.keys[0], times), times * first)
     projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
-    gradient = drawn.problem.compiled.site_gradient
+    observed, gradient = drawn.rows[:1], drawn.problem.compiled.site_gradient
     parts = [
-        gradient(drawn.fitted.x, np.concatenate([drawn.observed[None], projected[low : low + first]]))
+        gradient(drawn.fitted.x, np.concatenate([observed, projected[low : low + first]]))
         for low in range(0, len(projected), first)  # of the shape that is compiled
     ]
     gradients = {
         n: jnp.asarray(np.concatenate([np.asarray(g)[:1], *(np.asarray(part[n])[1:] for part in parts)]))
         for n, g in drawn.gradients.items()
     }
-    return replace(drawn, projected=projected, gradients=gradients)
+    return replace(drawn, rows=np.concatenate([observed, projected]), gradients=gradients)
 
 
 def _projected(problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array) -> np.ndarray:

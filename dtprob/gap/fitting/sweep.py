@@ -57,8 +57,12 @@ def swept(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) ->
     return x
 
 
-def elsewhere(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) -> list[np.ndarray]:
-    """Points at which all clusters have one of their coordinates at the same place, of those that may have several optima.
+def elsewhere(
+    problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Points at which all clusters have one of their coordinates at the same place, with the terms there.
+
+    Of coordinates that may have several optima only.
 
     Args:
         problem: the model on its data.
@@ -68,14 +72,14 @@ def elsewhere(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms
     found = _locals(problem)
     if len(found) > _MOST or any(one.is_angle for one in found):
         return []
-    points: list[np.ndarray] = []
+    points: list[tuple[np.ndarray, np.ndarray]] = []
     for one in found:
         line = []
         for place in _places(problem, one.name):
             moved = x.copy()
             moved[one.positions] = place
-            line.append(moved)
-        if _is_bent(np.stack([np.nan_to_num(terms(point), nan=-np.inf) for point in line])):
+            line.append((moved, np.nan_to_num(terms(moved), nan=-np.inf)))
+        if _is_bent(np.stack([values for _, values in line])):
             points += line
     return points
 

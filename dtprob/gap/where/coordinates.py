@@ -38,7 +38,6 @@ def scan_coordinates(
     Returns the blocks that stand out, family-wise at 1%, and for each axis the energy at its positions in standard
     deviations, NaN where nothing is observed.
     """
-    observed, null = drawn.observed, drawn.projected
     blocks: list[tuple[str, int, int]] = []
     p, excess, maps = [], [], {}
     located = problem.rows.by_cluster(problem.rows.located) == 1
@@ -47,7 +46,7 @@ def scan_coordinates(
         size = int(index.max()) + 1
         if size < 2:
             continue
-        energy = np.stack([_energy(rows, index, size) for rows in (observed, *null)])
+        energy = np.stack([_energy(rows, index, size) for rows in drawn.rows])
         spread = energy[1:].std(0)
         beyond, nothing = energy[0] - energy[1:].mean(0), np.full(size, np.nan)
         maps[axis] = np.divide(beyond, spread, out=nothing, where=spread > 0)

@@ -12,7 +12,7 @@ import numpy as np
 from scipy import sparse, stats
 
 from dtprob.gap.model.problem import Problem
-from dtprob.models.declaration import is_unnamed
+from dtprob.models.declaration import Site, is_unnamed
 
 _SMOOTH_FROM: Final = 6
 _ORDER: Final = 4
@@ -206,15 +206,10 @@ def _rank(column: np.ndarray) -> np.ndarray:
 
 def columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
     """Columns of the data (size,) that lie along an axis of the observations and vary; of positions each coordinate."""
-    observed = problem.declaration.observed.values()
-    if not any(axis in site.axes for site in observed):
+    if not any(axis in site.axes for site in problem.declaration.observed.values()):
         return {}
-    arguments = {site.argument for site in observed}
     found: dict[str, np.ndarray] = {}
-    for name, values in problem.data.items():
-        if name in arguments or not eqx.is_array_like(values):
-            continue
-        column = np.asarray(values)
+    for name, column in _given(problem):
         if column.shape == (size,):
             found[name] = column
         elif column.ndim == 2 and column.shape[0] == size and column.shape[1] <= 3:
@@ -225,3 +220,16 @@ def columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
         for name, column in found.items()
         if any(np.issubdtype(column.dtype, kind) for kind in real) and len(np.unique(column)) > 1
     }
+
+
+def whole_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
+    """Columns of the data that have an entry for each observation of a site of several axes."""
+    return {n: c for n, c in _given(problem) if c.ndim > 1 and c.shape == site.shape}
+
+
+def _given(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of the data, but for what is observed."""
+    arguments = {site.argument for site in problem.declaration.observed.values()}
+    for name, values in problem.data.items():
+        if name not in arguments and eqx.is_array_like(values):
+            yield name, np.asarray(values)

@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
@@ -20,7 +19,7 @@ from scipy import sparse, stats
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
-from dtprob.gap.where.curves import columns
+from dtprob.gap.where.curves import columns, whole_columns
 from dtprob.gap.where.families import by_observation
 from dtprob.models.declaration import Site
 
@@ -99,7 +98,7 @@ def differences(problem: Problem, drawn: Replicates) -> tuple[Differences, ...]:
     if all(weight is None for weight in weights.values()):
         return ()
     found: list[Differences] = []
-    for name, rows in by_observation(problem, np.concatenate([drawn.observed[None], drawn.projected])):
+    for name, rows in by_observation(problem, drawn.rows):
         site, weight = problem.declaration.observed[name], weights[name]
         if weight is None:
             continue
@@ -132,12 +131,7 @@ def _of_each(problem: Problem, x: np.ndarray, site: Site) -> dict[str, np.ndarra
     found = {
         n: np.asarray(here[n]) for n in problem.float_sites if n in here and np.array_equal(here[n], there[n])
     }
-    if len(site.shape) > 1:
-        found |= {
-            name: np.asarray(column)
-            for name, column in problem.data.items()
-            if name != site.argument and eqx.is_array_like(column)
-        }
+    found |= whole_columns(problem, site)
     return {n: v for n, v in found.items() if v.shape == site.shape and not np.iscomplexobj(v)}
 
 

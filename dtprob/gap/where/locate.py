@@ -12,7 +12,6 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from dtprob.gap.fitting.bootstrap import Replicates, more
@@ -22,7 +21,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
-from dtprob.gap.where.curves import Quantity, curves, quantity
+from dtprob.gap.where.curves import Quantity, curves, quantity, whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
@@ -123,7 +122,7 @@ def _test_sites(
 ) -> _Tested:
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
     found = [deterministic(n, axes[n], ways.values[n], np.asarray(g)) for n, g in drawn.gradients.items()]
-    found += observed(problem, np.concatenate([drawn.observed[None], drawn.projected]))
+    found += observed(problem, drawn.rows)
     tested = [
         (site, [family_test(*family) for family in families(ways.along, ways.over, site)]) for site in found
     ]
@@ -138,15 +137,10 @@ def _test_sites(
 
 def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
     """What the model computes and the data tell along several axes: a perturbation may vary over it."""
-    arguments = {site.argument for site in problem.declaration.observed.values()}
     columns = {
-        name: (site.axes, np.asarray(column))
-        for name, column in problem.data.items()
+        name: (site.axes, column)
         for site in problem.declaration.observed.values()
-        if name not in arguments
-        and eqx.is_array_like(column)
-        and np.ndim(column) > 1
-        and np.shape(column) == site.shape
+        for name, column in whole_columns(problem, site).items()
     }
     computed = {name: (problem.declaration.sites[name].axes, value) for name, value in values.items()}
     for name, (axes, value) in (columns | computed).items():
@@ -188,7 +182,7 @@ def _finding(
     best = min(tests, key=lambda test: (test.p_value, -float((test.first[0] ** 2).sum())))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
-    rows = np.concatenate([drawn.observed[None], drawn.projected[:CHANCE]])
+    rows = drawn.rows[: 1 + CHANCE]
     slope = np.einsum("ncm,ncm->n", shifts, rows)
     curvature = np.einsum("ncm,ncm->n", shifts, shifts)
     gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)

@@ -65,27 +65,30 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
             values.update(part)
         for name, values in likelihoods.items():
             best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
-            gain = float(values[best]) - here
-            if name not in found or gain > found[name].gain:
-                found[name] = Found(gain, anchor, lines[name][best])
+            _keep(found, name, Found(float(values[best]) - here, anchor, lines[name][best]))
     for name, one in _found_anew(problem, x, means).items():
-        if name not in found or one.gain > found[name].gain:
-            found[name] = one
+        _keep(found, name, one)
     return found
+
+
+def _keep(found: dict[str, Found], name: str, one: Found) -> None:
+    """Put what gains more than what was found before."""
+    if name not in found or one.gain > found[name].gain:
+        found[name] = one
 
 
 def _found_anew(problem: Problem, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, Found]:
     """Effects that gain at a large size with clusters' own coordinates where they are best then; see `elsewhere`."""
-    others = elsewhere(problem, x, problem.compiled.by_cluster)
+    by_cluster = problem.compiled.by_cluster
+    others = elsewhere(problem, x, by_cluster)
     if not others:
         return {}
-    points = [x, *others]
+    points = [x, *(point for point, _ in others)]
+    here = float(np.fmax.reduce([by_cluster(x), *(terms for _, terms in others)]).sum())
     lines = {e.name: _lines(e, LARGE[LARGE > 0] if sides(e).all() else LARGE) for e in effects}
     best = {name: np.full((len(line), problem.n_cluster), -np.inf) for name, line in lines.items()}
     chosen = {name: np.zeros(terms.shape, int) for name, terms in best.items()}
-    here = np.full(problem.n_cluster, -np.inf)
     for i, point in enumerate(points):
-        here = np.fmax(here, problem.compiled.by_cluster(point))
         for name, part, terms in _terms(problem, surroundings(problem, point), lines):
             chosen[name][part] = np.where(terms > best[name][part], i, chosen[name][part])
             best[name][part] = np.maximum(terms, best[name][part])
@@ -93,9 +96,9 @@ def _found_anew(problem: Problem, x: np.ndarray, effects: Sequence[Effect]) -> d
     for name, line in lines.items():
         total = best[name].sum(axis=1)
         k = int(np.argmax(total))
-        if total[k] > here.sum():
+        if total[k] > here:
             x_there = combined(problem, points, chosen[name][k])
-            found[name] = Found(float(total[k] - here.sum()), x_there, line[k])
+            found[name] = Found(float(total[k]) - here, x_there, line[k])
     return found
 
 

@@ -92,7 +92,7 @@ def screen(
     told = mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
     scores = replace(told, price=np.array([placed[e.name].price if e.name in placed else 0.0 for e in means]))
     energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
-    tested = field_tests(energy, [e.name for e in fields], len(drawn.projected))
+    tested = field_tests(energy, [e.name for e in fields], drawn.at_sites)
     (mean_p, mean_z), null_p = _mean_tests(scores, scores.u[None]), _mean_tests(scores, scores.u_null)[0]
     for k, found in ((k, placed[e.name]) for k, e in enumerate(means) if e.name in placed):
         mean_p[0, k], null_p[:, k] = found.p_value, 1.0

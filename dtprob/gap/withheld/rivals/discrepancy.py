@@ -36,7 +36,7 @@ def gaussian_process(seen: Look) -> Claim:
     Args:
         seen: the base fit.
     """
-    rows = np.concatenate([seen.drawn.observed[None], seen.drawn.projected])
+    rows = seen.drawn.rows
     found = [_at(seen, rows, length) for length in LENGTHS]
     evidence = np.max([values.max(axis=1) for values, _, _ in found], axis=0)
     values, features, curvature = max(found, key=lambda f: f[0][0].max())

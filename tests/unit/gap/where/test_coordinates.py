@@ -15,7 +15,7 @@ def scanned(observed, null):
         located=np.ones(observed.shape), coordinates={"device": position}, by_cluster=lambda values: values
     )
     problem = SimpleNamespace(rows=rows, declaration=SimpleNamespace(cluster="link"))
-    return scan_coordinates(problem, SimpleNamespace(observed=observed, projected=null))
+    return scan_coordinates(problem, SimpleNamespace(rows=np.stack([observed, *null])))
 
 
 def test_a_position_without_observations_has_no_excess():
