@@ -136,8 +136,12 @@ def test_two_effects_are_found_one_after_the_other(seed):
     found = run(line, draw("line", seed=20 + seed, shift=shift), key=seed)
     assert found.verdict == "LISTED"
     assert set(found.causes[0].effects) == {"bend", "ripple"}
-    gained = {frozenset(t["effects"]): t["gain_nats"] for t in found.sections["tried"]}
-    assert 0 < gained[frozenset(["bend"])] < gained[frozenset(["bend", "ripple"])]
+    tried = {frozenset(t["effects"]): t for t in found.sections["tried"]}
+    alone, both = tried[frozenset(["bend"])], tried[frozenset(["bend", "ripple"])]
+    assert 0 < alone["gain_nats"] < both["gain_nats"]
+    assert alone["behind_nats"] > 3
+    behind = [t["behind_nats"] for t in found.sections["tried"]]
+    assert behind == sorted(behind)
 
 
 @pytest.mark.parametrize("seed", range(3))

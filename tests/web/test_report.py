@@ -95,11 +95,14 @@ def test_what_was_fitted_besides_is_compared_with_the_named_cause(examples: dict
         {"effects": names, "gain_nats": 80.0, "behind_nats": 0.0},
         {"effects": ["doppler"], "gain_nats": 60.0, "behind_nats": 20.0},
         {"effects": [*names, "doppler"], "gain_nats": 81.0, "behind_nats": 3.0},
+        {"effects": ["tilted_antenna"], "gain_nats": 80.0, "behind_nats": 0.0},
     ]
+    report["causes"][0]["alias_class"] = [["tilted_antenna"]]
     text = Page(render(report, None, title="x")).text
     assert "Why not another one" in text
     assert re.search(r"Doppler 75% ?> 10⁶ times", text)
     assert re.search(r"and doppler 100% ?20 times", text)
+    assert not re.search(r"Tilted antenna 100%", text)  # it is told as one that is just as possible
 
 
 def test_summary_of_the_diagnosis_is_the_headline(examples: dict[str, Any]) -> None:

@@ -18,8 +18,10 @@ from dtprob.effects.effect import Effect
 
 SCALES: Final = np.geomspace(1e-4, 1.0, 25)
 """Prior scales, as shares of the largest plausible one."""
-LARGE: Final = np.array([-2.0, -10 / 7, -0.7, 0.7, 10 / 7, 2.0])
-"""Large sizes to try, in standard deviations of the prior: shares, whose prior is 0.7 wide, are whole at 10 / 7."""
+WHOLE: Final = 10 / 7
+"""Size at which a share is whole, in standard deviations of its prior, which is 0.7 wide."""
+LARGE: Final = np.array([-2.0, -WHOLE, -0.7, 0.7, WHOLE, 2.0])
+"""Large sizes to try, in standard deviations of the prior."""
 
 
 def log_bayes_factor(

@@ -27,6 +27,8 @@ _MOST: Final = 4
 _BEND: Final = 3.0
 """Nats by which the mean of two places has to lie above the one between them, twice over."""
 _LOWEST: Final = -1e9
+_STEPS: Final = (-3.0, -1.5, 1.5, 3.0)
+"""How far coordinates are moved beside one that may have several optima, in standard deviations of their prior."""
 
 
 class _Local(NamedTuple):
@@ -62,7 +64,8 @@ def elsewhere(
 ) -> list[tuple[np.ndarray, np.ndarray]]:
     """Points at which all clusters have one of their coordinates at the same place, with the terms there.
 
-    Of coordinates that may have several optima only.
+    Of coordinates that may have several optima only; at each place also the others are moved, one at a time: where a link's
+    delay is another one, so is its gain.
 
     Args:
         problem: the model on its data.
@@ -81,7 +84,18 @@ def elsewhere(
             line.append((moved, np.nan_to_num(terms(moved), nan=-np.inf)))
         if _is_bent(np.stack([values for _, values in line])):
             points += line
+            for other in (other for other in found if other is not one):
+                points += [_moved(problem, point, other, by, terms) for point, _ in line for by in _STEPS]
     return points
+
+
+def _moved(
+    problem: Problem, x: np.ndarray, one: _Local, by: float, terms: Terms
+) -> tuple[np.ndarray, np.ndarray]:
+    """The point with a coordinate of all clusters moved, in standard deviations of its prior, and the terms there."""
+    moved = x.copy()
+    moved[one.positions] += by * problem.usual[one.name][1]
+    return moved, np.nan_to_num(terms(moved), nan=-np.inf)
 
 
 def _is_bent(values: Float[np.ndarray, "place cluster"]) -> bool:

@@ -3,8 +3,8 @@
 Every effect is tried at four sizes; where the log likelihood is not the parabola that its first two sizes promise, the
 effect is scanned over its whole plausible range. The rewritten sites go through the base model as perturbations, so no
 candidate needs a compilation of its own. Where clusters have coordinates of their own with several optima (a link's delay
-where only powers are seen), large sizes are tried with these found anew: a swap of two transmitters explains nothing
-while delays stand where the wrong one put them.
+where only powers are seen), whole effects are tried with these found anew: a swap of two transmitters explains nothing
+while delays and gains stand where the wrong one put them.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import LARGE, nulls, scales, sides
+from dtprob.gap.fitting.plausible import WHOLE, nulls, scales, sides
 from dtprob.gap.fitting.sweep import combined, elsewhere
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.directions import Surroundings, surroundings
@@ -78,14 +78,14 @@ def _keep(found: dict[str, Found], name: str, one: Found) -> None:
 
 
 def _found_anew(problem: Problem, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, Found]:
-    """Effects that gain at a large size with clusters' own coordinates where they are best then; see `elsewhere`."""
+    """Effects that gain at their whole size with clusters' own coordinates where they are best then; see `elsewhere`."""
     by_cluster = problem.compiled.by_cluster
     others = elsewhere(problem, x, by_cluster)
     if not others:
         return {}
     points = [x, *(point for point, _ in others)]
     here = float(np.fmax.reduce([by_cluster(x), *(terms for _, terms in others)]).sum())
-    lines = {e.name: _lines(e, LARGE[LARGE > 0] if sides(e).all() else LARGE) for e in effects}
+    lines = {e.name: _lines(e, np.array([WHOLE] if sides(e).all() else [-WHOLE, WHOLE])) for e in effects}
     best = {name: np.full((len(line), problem.n_cluster), -np.inf) for name, line in lines.items()}
     chosen = {name: np.zeros(terms.shape, int) for name, terms in best.items()}
     for i, point in enumerate(points):

@@ -34,8 +34,16 @@ def measured(channel, frequency=FREQUENCY, **more):
     )
 
 
-def at(paths, **values):
-    """The sites with a flat pulse, a receiver on its law far from saturation and no tail, but for `values`."""
+def at(paths, given=None, **values):
+    """Values of the sites of `traced`."""
+    return {name: np.asarray(message["value"]) for name, message in traced(paths, given, **values).items()}
+
+
+def traced(paths, given=None, **values):
+    """The sites with a flat pulse, a receiver on its law far from saturation and no tail, but for `values`.
+
+    Arguments of the model may be given.
+    """
     n = paths.n_link
     data = {"paths": paths, "subcarrier_frequency": jnp.asarray(FREQUENCY), "tap_delay": jnp.asarray(TAPS)}
     null = {"link_delay": n, "link_gain": n, "pulse_log_gain": 8, "pulse_phase": 7}
@@ -49,8 +57,7 @@ def at(paths, **values):
     }
     start = {name: jnp.zeros(size) for name, size in null.items()}
     start |= {name: jnp.asarray(value) for name, value in single.items()}
-    trace = trace_model(ultra_wideband_profile, data, jax.random.key(0), start | values)
-    return {name: np.asarray(message["value"]) for name, message in trace.items()}
+    return trace_model(ultra_wideband_profile, data | (given or {}), jax.random.key(0), start | values)
 
 
 def test_taps_hold_what_paths_of_random_phases_bring(paths):
@@ -71,13 +78,14 @@ def test_taps_hold_what_paths_of_random_phases_bring(paths):
 
 def test_the_tail_is_exponential_behind_the_first_path(paths):
     decay = 8e-9
-    sites = at(paths, tail_share=jnp.asarray(0.2), tail_decay=jnp.asarray(decay))
+    shares = {"tail_share": jnp.asarray(0.2), "tail_decay": jnp.asarray(decay)}
+    sites = at(paths, **shares, ranging_offset=jnp.asarray(0.5))
     mask, delay = np.asarray(paths.mask), np.asarray(paths.delay)
     first = np.where(mask, delay, np.inf).min(axis=1)
     free = (1 / (4 * np.pi * float(paths.frequency) * first)) ** 2
     step = TAPS[1] - TAPS[0]
     for tail, start, level in zip(sites["tail"], first, free, strict=True):
-        behind = TAPS - start
+        behind = TAPS - start - 2.5e-9
         assert np.all(tail[behind <= 0] == 0)
         late = behind > 8 * step
         expected = 0.2 * level * step / decay * np.exp(-behind[late] / decay)
@@ -97,6 +105,24 @@ def test_the_time_origin_is_late_by_the_errors_of_ranging(paths):
     np.testing.assert_allclose(sites["receiver_delay"], 2.5e-9 + 0.6e-9 * delay, rtol=1e-6)
     found = declare(ultra_wideband_profile, arguments(paths)).sites
     assert (found["link_delay"].distribution, found["power"].distribution) == ("StudentT", "Gamma")
+
+
+def test_taps_spread_as_the_shape_says_about_a_mean_that_noise_raises(paths):
+    noise = jnp.full(5, 1e-9)
+    quiet = traced(paths)["tap_power"]["value"]
+    trace = traced(paths, {"tap_noise": noise}, shape=jnp.asarray(2.0))
+    law, mean = trace["power"]["fn"], np.asarray(trace["tap_power"]["value"])
+    np.testing.assert_allclose(mean, quiet + noise[:, None], rtol=1e-6)
+    np.testing.assert_allclose(law.mean, mean, rtol=1e-6)
+    np.testing.assert_allclose(law.variance, mean**2 / 2.0, rtol=1e-6)
+
+
+def test_unknown_materials_change_the_powers_of_their_paths(paths):
+    known, unknown = at(paths), at(paths, {"materials": "shared"})
+    assert not np.allclose(unknown["permittivity"], known["permittivity"], atol=0.0)
+    gain = np.asarray(field.path_gain(paths, unknown["permittivity"], unknown["conductivity"]))
+    np.testing.assert_allclose(unknown["path_power"], np.abs(gain) ** 2, rtol=1e-6)
+    assert not np.allclose(unknown["path_power"], known["path_power"], atol=0.0)
 
 
 def test_the_level_saturates(paths):

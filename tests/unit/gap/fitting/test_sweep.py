@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from scipy import stats
 
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
@@ -25,7 +26,7 @@ LATE = np.array([-1.6, -0.7, 0.0, 0.9, 1.7])
 PHASE = np.array([0.3, -2.0, 1.0, 2.9, -0.6])
 NOISE = 0.1
 TAPS = np.linspace(-3.0, 3.0, 31)
-PULSES = np.array([-0.6, 0.0, 1.0, 2.2])
+PULSES, WEAKER = np.array([-0.6, 0.0, 1.0, 2.2]), 0.2
 BEND = Effect(
     "bend", {"level": lambda value, p, _: value + p["by"]}, (Parameter("by", dist.Normal(0.0, 1.0)),)
 )
@@ -57,8 +58,12 @@ def problem():
     )
 
 
+def own(problem, x, name):
+    return x[problem.layout[name].index[:, 0]]
+
+
 def places(problem, x):
-    return x[problem.layout["late"].index[:, 0]]
+    return own(problem, x, "late")
 
 
 def test_usual_places_are_those_of_the_prior(problem):
@@ -118,33 +123,62 @@ def test_a_place_without_an_angle_is_looked_for_too():
 
 @model(cluster="link", axes={"amplitude": ("pulse",), "power": ("link", "tap")})
 def two_places(links, y=None):
-    """Each link has two pulses; those of another place could stand there instead."""
+    """Each link has two pulses of a strength of its own; those of another place could stand there instead."""
     amplitude = numpyro.deterministic("amplitude", jnp.array([1.0, 1.0, 0.0, 0.0]))
     with numpyro.plate("link", links, dim=-2):
         late = numpyro.sample("late", dist.Normal(0.0, 1.0))
+        loud = numpyro.sample("loud", dist.Normal(0.0, 1.0))
         apart = (TAPS - late)[..., None] - PULSES
-        power = numpyro.deterministic("power", jnp.exp(-0.5 * (apart / 0.2) ** 2) @ amplitude)
+        pulses = jnp.exp(-0.5 * (apart / 0.2) ** 2) @ amplitude
+        power = numpyro.deterministic("power", jnp.exp(loud) * pulses)
         with numpyro.plate("tap", len(TAPS), dim=-1):
             numpyro.sample("y", dist.Normal(power, NOISE), obs=y)
 
 
+def swap_size(name):
+    return (Parameter(name, dist.Normal(0.0, 0.7)),)
+
+
+def elsewhere_pulses(late, loud):
+    """Pulses (link, tap) of the other place, which is weaker."""
+    apart = TAPS - late[:, None] - PULSES[2:, None, None]
+    return WEAKER * np.exp(loud)[:, None] * np.exp(-0.5 * (apart / 0.2) ** 2).sum(0)
+
+
 def test_what_needs_the_links_found_anew_is_seen_by_the_scan(monkeypatch):
-    late = LATE / 4
+    late, loud = LATE / 4, np.array([1.6, 1.8, 1.4, 1.7, 1.6])
     noise = NOISE * np.random.default_rng(4).normal(size=(len(late), len(TAPS)))
-    power = np.exp(-0.5 * ((TAPS - late[:, None] - PULSES[2:, None, None]) / 0.2) ** 2).sum(0)
+    power = elsewhere_pulses(late, loud)
     swap = Effect(
         "swap",
-        {"amplitude": lambda value, p, _: value + p["share"] * (value[::-1] - value)},
-        (Parameter("share", dist.Normal(0.0, 0.7)),),
+        {"amplitude": lambda value, p, _: value + p["share"] * (WEAKER * value[::-1] - value)},
+        swap_size("share"),
     )
-    problem = Problem(two_places, {"links": len(late), "y": jnp.asarray(power + noise)}, [swap])
-    fitted = settled(problem, fitting.fit(problem, problem.start({"late": np.zeros((5, 1))})))
+    nothing = Effect("nothing", {"amplitude": lambda value, p, _: value + 0 * p["by"]}, swap_size("by"))
+    data = {"links": len(late), "y": jnp.asarray(power + noise)}
+    problem = Problem(two_places, data, [swap, nothing])
+    start = problem.start({"late": np.zeros((5, 1)), "loud": np.zeros((5, 1))})
+    assert scan(problem, start, ["nothing"]) == {}  # links found anew gain without it too
+    fitted = settled(problem, fitting.fit(problem, start))
     assert np.abs(places(problem, fitted.x) - late).max() > 0.5
+    assert np.abs(own(problem, fitted.x, "loud") - loud).min() > 1.5
     found = scan(problem, fitted.x, ["swap"])["swap"]
     assert found.gain > 100
     assert np.isclose(found.parameters[0], 1.0)
     assert np.sum(np.abs(places(problem, found.x) - late) < 0.3) >= 4  # trial places are far apart
     held = scan_module.elsewhere
+    there = places(problem, found.x), own(problem, found.x, "loud")
+    rest = (np.asarray(problem.data["y"]) - elsewhere_pulses(*there)) / NOISE
+    terms = stats.norm.logpdf(rest).sum(1) - len(TAPS) * np.log(NOISE)
+    terms += stats.norm.logpdf(there).sum(0)
+    by_cluster = problem.compiled.by_cluster
+    unswapped = np.max([by_cluster(fitted.x), *(t for _, t in held(problem, fitted.x, by_cluster))], axis=0)
+    assert np.isclose(found.gain, terms.sum() - unswapped.sum(), rtol=1e-6)
+    for other, kept in ((1e6, 1e6), (1.0, found.gain)):
+        anew = scan_module.Found(other, found.x, found.parameters)
+        merged: dict[str, scan_module.Found] = {"swap": found}
+        scan_module._keep(merged, "swap", anew)
+        assert merged["swap"].gain == kept
     monkeypatch.setattr(scan_module, "elsewhere", lambda *_: [])
     assert "swap" not in scan(problem, fitted.x, ["swap"])
     linear = Problem(levels, {"y": jnp.asarray(power)}, [])

@@ -27,11 +27,13 @@ BEYOND = 3.0 * (PLACE > 0.75)
 GROUP = PLACE.argsort().argsort() * GROUPS // ROWS
 
 
-@model(cluster="row", axes={"square": ("row",)})
+@model(cluster="row", axes=dict.fromkeys(("square", "even", "fitted"), ("row",)))
 def levelled(place, kind, count, y=None):
     """One unknown level, whatever the columns say."""
     numpyro.deterministic("square", place**2)
+    numpyro.deterministic("even", jnp.ones(ROWS))
     level = numpyro.sample("level", dist.Normal(0.0, 100.0))
+    numpyro.deterministic("fitted", level * place)
     with numpyro.plate("row", ROWS):
         numpyro.sample("y", dist.Normal(level, SIGMA), obs=y)
 
@@ -52,12 +54,15 @@ def phasors(place, y=None):
         numpyro.sample("y", ComplexNormal(jnp.full(ROWS, level + 0j), 1.0), obs=y)
 
 
-def found(declared, data):
+def replicated(declared, data):
     problem = Problem(declared, {name: jnp.asarray(value) for name, value in data.items()}, [])
     fitted = fitting.fit(problem, problem.null())
     projection = project(problem, fitted)
-    drawn = replicate(problem, fitted, projection, jax.random.key(0), Settings())
-    return {one.column: one for one in differences(problem, drawn)}
+    return problem, replicate(problem, fitted, projection, jax.random.key(0), Settings())
+
+
+def found(declared, data):
+    return {one.column: one for one in differences(*replicated(declared, data))}
 
 
 @pytest.fixture(scope="module")
@@ -122,6 +127,32 @@ def test_groups_that_say_nothing_are_left_out():
     assert set(seen) == {"place"}  # each kind's mean is fitted
     assert seen["place"].place.max() < 0.76
     assert len(seen["place"].place) in {18, 19}
+
+
+@model(cluster="link", axes={"level": ("link",)})
+def of_two_observations(where, weight, y=None, z=None):
+    """Links with several values each, and another one of the same level."""
+    level = numpyro.deterministic("level", numpyro.sample("height", dist.Normal(0.0, 100.0)) * jnp.ones(40))
+    with numpyro.plate("link", 40, dim=-2), numpyro.plate("tap", 6, dim=-1):
+        numpyro.sample("y", dist.Normal(level[:, None], SIGMA), obs=y)
+    with numpyro.plate("link", 40, dim=-1):
+        numpyro.sample("z", dist.Normal(level, SIGMA), obs=z)
+
+
+def test_each_observation_has_its_own_and_columns_of_all_its_axes_count():
+    weight = PLACE.reshape(40, 6)
+    y, z = SIGMA * RNG.normal(size=(40, 6)) + 3.0 * (weight > 0.75), SIGMA * RNG.normal(size=40)
+    where = np.arange(40.0)
+    data = {"where": where, "weight": weight, "y": y, "z": z}
+    problem, drawn = replicated(of_two_observations, data)
+    seen = {(one.observed, one.axis, one.column): one for one in differences(problem, drawn)}
+    assert set(seen) == {("y", "", "weight"), ("y", "link", "where"), ("z", "link", "where")}
+    level = np.concatenate([y.ravel(), z]).mean()
+    expected = [(y - level).ravel()[g == GROUP].mean() for g in range(GROUPS)]
+    np.testing.assert_allclose(seen["y", "", "weight"].mean, expected, atol=5e-3)
+    of_z = seen["z", "link", "where"]
+    nearest = np.abs(where[:, None] - of_z.place).argmin(axis=1)
+    np.testing.assert_allclose(of_z.mean, [(z - level)[nearest == g].mean() for g in range(4)], atol=5e-3)
 
 
 def test_complex_values_have_none():
