@@ -51,7 +51,7 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
         x: the fit.
         names: candidates to look at.
     """
-    means = [e for e in problem.effects if e.kind == "mean" and e.rewrites and e.name in names]
+    means = _means(problem, names)
     small = {e.name: _lines(e, np.array([_SMALL, 2 * _SMALL, _LARGE, -_LARGE])) for e in means}
     found: dict[str, Found] = {}
     for anchor in (x, centre(problem, x)):
@@ -65,20 +65,21 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
             values.update(part)
         for name, values in likelihoods.items():
             best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
-            _keep(found, name, Found(float(values[best]) - here, anchor, lines[name][best]))
-    for name, one in _found_anew(problem, x, means).items():
-        _keep(found, name, one)
+            gain = float(values[best]) - here
+            if name not in found or gain > found[name].gain:
+                found[name] = Found(gain, anchor, lines[name][best])
     return found
 
 
-def _keep(found: dict[str, Found], name: str, one: Found) -> None:
-    """Put what gains more than what was found before."""
-    if name not in found or one.gain > found[name].gain:
-        found[name] = one
+def scan_anew(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Found]:
+    """Effects that gain at their whole size with clusters' own coordinates where they are best then; see `elsewhere`.
 
-
-def _found_anew(problem: Problem, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, Found]:
-    """Effects that gain at their whole size with clusters' own coordinates where they are best then; see `elsewhere`."""
+    Args:
+        problem: the model and candidates on their data.
+        x: the fit; what clusters share stays there.
+        names: candidates to look at.
+    """
+    effects = _means(problem, names)
     by_cluster = problem.compiled.by_cluster
     others = elsewhere(problem, x, by_cluster)
     if not others:
@@ -100,6 +101,10 @@ def _found_anew(problem: Problem, x: np.ndarray, effects: Sequence[Effect]) -> d
             x_there = combined(problem, points, chosen[name][k])
             found[name] = Found(float(total[k]) - here, x_there, line[k])
     return found
+
+
+def _means(problem: Problem, names: Sequence[str]) -> list[Effect]:
+    return [e for e in problem.effects if e.kind == "mean" and e.rewrites and e.name in names]
 
 
 def centre(problem: Problem, x: np.ndarray) -> np.ndarray:

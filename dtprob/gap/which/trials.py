@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -16,7 +17,7 @@ from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
-from dtprob.gap.which.scan import Found, scan
+from dtprob.gap.which.scan import Found, scan, scan_anew
 
 type Say = Callable[[str], None]
 
@@ -34,6 +35,8 @@ _LIVE: Final = 12
 """Effects that are live at once, at most, where fewer are wanted."""
 _HOPELESS: Final = 0.05
 """Share of the best candidate's promise below which another one is not refitted."""
+_WORTH: Final = 3.0
+"""Nats that an effect has to gain in a scan."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 
@@ -75,12 +78,11 @@ def tried(
         banned: a candidate that is not to be tried.
     """
     screening, fitted = seen.screening, seen.fitted
-    found: dict[str, Found] = {}
+    scans: list[dict[str, Found]] = []
     if not fitted.effects and seen.promise > _LARGE_GAP:
         say("scanning the effects' plausible sizes")
-        found = scan(seen.problem, seen.fitted.x, screening.names)
-    scanned = np.array([found[n].gain if n in found else -np.inf for n in screening.names])
-    chosen = [n for n in _chosen(seen, scanned, settings, banned) if n not in known]
+        scans = [look(seen.problem, seen.fitted.x, screening.names) for look in (scan, scan_anew)]
+    chosen = [n for n in _chosen(seen, scans, settings, banned) if n not in known]
     problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
     effects = {e.name: e for e in problem.effects}
@@ -93,8 +95,11 @@ def tried(
     for name in chosen:
         say(f"refitting with {name}")
         starts = starting_points(problem, start.x, effects[name], screening.step.get(name), settings)
-        if name in found:
-            starts.append(_scanned_start(problem, seen.problem, effects[name], found[name]))
+        starts += [
+            _scanned_start(problem, seen.problem, effects[name], found[name])
+            for found in scans
+            if name in found
+        ]
         trials[name] = refit(problem, start, effects[name], starts)
     return Trials(problem, polished(problem, start, trials, settings.polished))
 
@@ -152,8 +157,13 @@ def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Fo
     return x
 
 
-def _chosen(seen: View, scanned: np.ndarray, settings: Settings, banned: str | None) -> list[str]:
-    """The best candidates by score and, in equal number, by the scan."""
+def _chosen(
+    seen: View, scans: Sequence[Mapping[str, Found]], settings: Settings, banned: str | None
+) -> list[str]:
+    """The best candidates by score and, in equal number, by the scans, of which each has its turn.
+
+    Scans do not start from the same likelihood, so their gains cannot be compared.
+    """
     screening = seen.screening
     able = [
         i
@@ -163,7 +173,11 @@ def _chosen(seen: View, scanned: np.ndarray, settings: Settings, banned: str | N
     gain = screening.log_bayes_factor
     least = _HOPELESS * max((gain[i] for i in able), default=0.0)
     by_score = sorted((i for i in able if gain[i] > max(least, 0.0)), key=lambda i: -gain[i])
-    by_scan = sorted((i for i in able if scanned[i] > 3.0), key=lambda i: -scanned[i])
+    ranked = []
+    for found in scans:
+        gained = {i: found[screening.names[i]].gain for i in able if screening.names[i] in found}
+        ranked.append(sorted((i for i in gained if gained[i] > _WORTH), key=lambda i: -gained[i]))
+    by_scan = list(dict.fromkeys(i for turn in itertools.zip_longest(*ranked) for i in turn if i is not None))
     half = settings.candidates // 2
     chosen = dict.fromkeys([*by_score[:half], *by_scan[:half], *by_score[half:], *by_scan[half:]])
     return [screening.names[i] for i in list(chosen)[: settings.candidates]]

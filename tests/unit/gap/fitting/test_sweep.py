@@ -13,11 +13,10 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.fitting.marginal import marginal, settled
 from dtprob.gap.fitting.refit import starting_points
-from dtprob.gap.fitting.sweep import swept, turned
+from dtprob.gap.fitting.sweep import elsewhere, swept, turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.which import scan as scan_module
-from dtprob.gap.which.scan import scan
+from dtprob.gap.which.scan import scan, scan_anew
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
 
@@ -145,7 +144,7 @@ def elsewhere_pulses(late, loud):
     return WEAKER * np.exp(loud)[:, None] * np.exp(-0.5 * (apart / 0.2) ** 2).sum(0)
 
 
-def test_what_needs_the_links_found_anew_is_seen_by_the_scan(monkeypatch):
+def test_what_needs_the_links_found_anew_is_seen_by_the_scan():
     late, loud = LATE / 4, np.array([1.6, 1.8, 1.4, 1.7, 1.6])
     noise = NOISE * np.random.default_rng(4).normal(size=(len(late), len(TAPS)))
     power = elsewhere_pulses(late, loud)
@@ -158,31 +157,26 @@ def test_what_needs_the_links_found_anew_is_seen_by_the_scan(monkeypatch):
     data = {"links": len(late), "y": jnp.asarray(power + noise)}
     problem = Problem(two_places, data, [swap, nothing])
     start = problem.start({"late": np.zeros((5, 1)), "loud": np.zeros((5, 1))})
-    assert scan(problem, start, ["nothing"]) == {}  # links found anew gain without it too
+    assert scan_anew(problem, start, ["nothing"]) == {}  # links found anew gain without it too
     fitted = settled(problem, fitting.fit(problem, start))
     assert np.abs(places(problem, fitted.x) - late).max() > 0.5
     assert np.abs(own(problem, fitted.x, "loud") - loud).min() > 1.5
-    found = scan(problem, fitted.x, ["swap"])["swap"]
+    assert "swap" not in scan(problem, fitted.x, ["swap"])
+    found = scan_anew(problem, fitted.x, ["swap"])["swap"]
     assert found.gain > 100
     assert np.isclose(found.parameters[0], 1.0)
     assert np.sum(np.abs(places(problem, found.x) - late) < 0.3) >= 4  # trial places are far apart
-    held = scan_module.elsewhere
     there = places(problem, found.x), own(problem, found.x, "loud")
     rest = (np.asarray(problem.data["y"]) - elsewhere_pulses(*there)) / NOISE
     terms = stats.norm.logpdf(rest).sum(1) - len(TAPS) * np.log(NOISE)
     terms += stats.norm.logpdf(there).sum(0)
     by_cluster = problem.compiled.by_cluster
-    unswapped = np.max([by_cluster(fitted.x), *(t for _, t in held(problem, fitted.x, by_cluster))], axis=0)
+    unswapped = np.max(
+        [by_cluster(fitted.x), *(t for _, t in elsewhere(problem, fitted.x, by_cluster))], axis=0
+    )
     assert np.isclose(found.gain, terms.sum() - unswapped.sum(), rtol=1e-6)
-    for other, kept in ((1e6, 1e6), (1.0, found.gain)):
-        anew = scan_module.Found(other, found.x, found.parameters)
-        merged: dict[str, scan_module.Found] = {"swap": found}
-        scan_module._keep(merged, "swap", anew)
-        assert merged["swap"].gain == kept
-    monkeypatch.setattr(scan_module, "elsewhere", lambda *_: [])
-    assert "swap" not in scan(problem, fitted.x, ["swap"])
     linear = Problem(levels, {"y": jnp.asarray(power)}, [])
-    assert held(linear, linear.start({"level": np.zeros((5, 1))}), linear.compiled.by_cluster) == []
+    assert elsewhere(linear, linear.start({"level": np.zeros((5, 1))}), linear.compiled.by_cluster) == []
 
 
 @model(cluster="link")

@@ -1,0 +1,44 @@
+"""Which candidates are refitted: the best by score, and each scan's best in turn."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import numpyro.distributions as dist
+
+from dtprob.effects import Effect, Parameter
+from dtprob.gap.settings import Settings
+from dtprob.gap.which import trials
+from dtprob.gap.which.scan import Found
+
+NAMES = ("near", "far", "swap", "wall", "tilt", "drift")
+
+
+def effect(name):
+    return Effect(
+        name, {"mean": lambda value, p, _: value + p["by"]}, (Parameter("by", dist.Normal(0.0, 1.0)),)
+    )
+
+
+def chosen(scores, scans, count, absorbed=()):
+    screening = SimpleNamespace(
+        names=NAMES,
+        absorbed_by=["gain" if name in absorbed else None for name in NAMES],
+        log_bayes_factor=np.array([scores.get(name, -1.0) for name in NAMES]),
+    )
+    problem = SimpleNamespace(effects=[effect(name) for name in NAMES])
+    seen = cast("Any", SimpleNamespace(screening=screening, problem=problem))
+    found = [{n: Found(gain, np.zeros(0), np.zeros(1)) for n, gain in scan.items()} for scan in scans]
+    return trials._chosen(seen, found, Settings(candidates=count), None)
+
+
+def test_each_scan_has_its_turn_however_much_another_gains():
+    scans = [{"wall": 50.0, "tilt": 40.0, "drift": 30.0}, {"swap": 20.0, "tilt": 10.0}]
+    assert chosen({"near": 90.0, "far": 80.0}, scans, 4) == ["near", "far", "wall", "swap"]
+    assert chosen({"near": 90.0}, scans, 6) == ["near", "wall", "swap", "tilt", "drift"]
+
+
+def test_what_gains_nothing_or_is_absorbed_is_not_refitted():
+    scans = [{"wall": 2.0, "tilt": np.inf}, {}]
+    assert chosen({"near": 90.0, "far": 1.0}, scans, 6, absorbed=("tilt",)) == ["near"]
+    assert chosen({}, [], 6) == []
