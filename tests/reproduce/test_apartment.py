@@ -204,7 +204,8 @@ def test_losses_are_counted_in_nats_of_a_link(measured, monkeypatch):
         return SimpleNamespace(maps={"links": links}, causes=(), verdict="NO_GAP")
 
     monkeypatch.setattr(apartment, "_diagnosed", diagnosed)
-    found = apartment.answer(TWINS[0], apartment.jax.random.key(0))
+    coarse = TWINS[0]._replace(scene={"samples": 20_000})
+    found = apartment.answer(coarse, apartment.jax.random.key(0))
     assert found.link.tolist() == list(LINKS)
     assert np.allclose(found.before, 63 * 2.0)
     assert np.allclose(found.after, found.before)  # nothing is named
