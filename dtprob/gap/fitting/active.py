@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
 
@@ -45,6 +45,11 @@ class Active:
         """Positions of the local coordinates, (cluster, local)."""
         parts = [b.index for b in self.blocks if b.local]
         return np.concatenate(parts, axis=1) if parts else np.zeros((len(self.weights), 0), int)
+
+    @property
+    def own(self) -> Active:
+        """The local coordinates alone, the global ones held."""
+        return replace(self, blocks=tuple(b for b in self.blocks if b.local))
 
 
 def activate(

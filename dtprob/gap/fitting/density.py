@@ -25,7 +25,7 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
     _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
-    if problem.volume is not None:
+    if problem.volume is not None and n:
         base, weights = active.base_index, np.asarray(active.weights)
         place = np.isin(g_index, base)
         prior_gradient[base] += weights @ problem.volume.gradient(x[base])

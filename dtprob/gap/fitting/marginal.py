@@ -69,9 +69,10 @@ def own_mode(
         tolerance: stop when the gain that a step promises, in nats per cluster, falls below.
     """
     x, terms, damping = x.copy(), cluster_terms(problem, active, x), np.float64(1e-3)
+    own = active.own
     for _ in range(steps):
-        step = local_step(system_at(problem, active, x), float(damping))
-        trial = moved(active, x, step)
+        step = local_step(system_at(problem, own, x), float(damping))
+        trial = moved(own, x, step)
         new = cluster_terms(problem, active, trial)
         better = new > terms
         x[active.local_index[better]] = trial[active.local_index[better]]
@@ -79,4 +80,4 @@ def own_mode(
         damping = damping / 4 if better.all() else damping * 4
         if step.gain < tolerance * problem.n_cluster:
             break
-    return x, positive(system_at(problem, active, x).local)
+    return x, positive(system_at(problem, own, x).local)
