@@ -94,24 +94,36 @@ def bandwidth_mismatch(sites: Sites, data: Data) -> list[Effect]:
         return []
     if band(data) is None or data.get("paths") is None:
         return []
+    own_origin = offers(sites, "receiver_delay")
 
-    def stretch(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-        return value * (1.0 + p["scale"])
+    def origin(delay: Any, context: Mapping[str, Any]) -> Any:
+        return _first(delay, context["paths"]) if own_origin else 0.0
+
+    def stretch(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        return value + p["scale"] * (value - origin(value, context))
 
     def hold(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        turns = context["paths"].frequency * p["scale"] / (1.0 + p["scale"]) * context["path_delay"]
-        return value + 2 * jnp.pi * turns[:, None, :]
+        after = context["path_delay"]
+        longer = p["scale"] / (1.0 + p["scale"]) * (after - origin(after, context))
+        return value + 2 * jnp.pi * context["paths"].frequency * longer[:, None, :]
 
     return [
         Effect(
             "bandwidth_mismatch",
             of_model(sites, {"path_delay": stretch, "path_phase": hold}),
             (normal("scale", 0.1),),
-            physics="All subcarriers lie this share farther from the carrier than recorded; the carrier stays.",
+            physics="All subcarriers lie this share farther from the carrier than recorded; the carrier stays. Where each"
+            " link has a time origin of its own, its first path stays too.",
             source="f_k' tau = f_k (1 + s) tau; the phase that the stretched delay gives the carrier is taken off.",
             requires=("paths",),
         )
     ]
+
+
+def _first(delay: jax.Array, paths: PathSet) -> jax.Array:
+    """Delay of each link's first path, (link, 1); 0 where there is none."""
+    first = jnp.min(jnp.where(paths.mask, delay, jnp.inf), axis=1, keepdims=True)
+    return jnp.where(jnp.isfinite(first), first, 0.0)
 
 
 def _text(place: np.ndarray) -> str:

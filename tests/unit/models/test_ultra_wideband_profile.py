@@ -6,9 +6,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpyro import handlers
 
 from dtprob.data.kinds import ChannelData
-from dtprob.effects import catalogue
+from dtprob.effects import Rewriting, catalogue
 from dtprob.errors import InputError
 from dtprob.models.declaration import declare, trace_model
 from dtprob.models.ultra_wideband import delay_profile, ultra_wideband_profile
@@ -172,3 +173,17 @@ def test_the_contract_and_the_effects_that_powers_tell(paths):
     families = {effect.family for effect in offered}
     assert {"receiver_displacement", "missing_object", "bandwidth_mismatch", "carrier_mismatch"} <= families
     assert not {"phase_error", "clock_drift", "amplifier_nonlinearity"} & families
+
+
+def test_another_bandwidth_stretches_what_follows_the_first_path_alone(paths):
+    """The time origin was ranged, by the time of flight: no spacing of subcarriers enters it."""
+    data = arguments(paths)
+    (effect,) = catalogue(declare(ultra_wideband_profile, data).sites, data, ["bandwidth_mismatch"])
+    given = {effect.name: {"scale": jnp.asarray(0.2)}}
+    with handlers.trace() as found, Rewriting(None, [effect], given, data), handlers.seed(rng_seed=0):
+        ultra_wideband_profile(**data)
+    mask, own = np.asarray(paths.mask), np.asarray(paths.delay)
+    first = np.where(mask, own, np.inf).min(axis=1, keepdims=True)
+    stretched = np.asarray(found["path_delay"]["value"])
+    np.testing.assert_allclose(stretched[mask], (first + 1.2 * (own - first))[mask], rtol=1e-5)
+    assert np.ptp(own[mask]) > 0
