@@ -13,6 +13,7 @@ from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import declare, model
 from dtprob.models.scene import AXES
 from dtprob.raytracing import field
+from dtprob.raytracing.beyond import with_all
 from dtprob.raytracing.geometry import unfold
 from dtprob.raytracing.paths import NONE, REFRACTION, SPECULAR, PathSet, validate
 
@@ -99,7 +100,7 @@ def trace(rx: Any = 0.0, tx: Any = 0.0, planes: Any = 0.0) -> PathSet:
 
 @jax.jit
 def _gain(paths, permittivity, conductivity, thickness):
-    return field.path_gain(paths, permittivity, conductivity, thickness=thickness)
+    return field.path_gain(with_all(paths), permittivity, conductivity, thickness=thickness)
 
 
 @jax.jit
@@ -129,7 +130,10 @@ def world_channel(
     permittivity = numpyro.deterministic("permittivity", 1.0 + scale * (paths.permittivity - 1.0))
     conductivity = numpyro.deterministic("conductivity", paths.conductivity)
     thickness = numpyro.deterministic("thickness", paths.thickness)
-    gain = numpyro.deterministic("path_gain", _gain(paths, permittivity, conductivity, thickness))
+    gain = _gain(paths, permittivity, conductivity, thickness)
+    if paths.beyond_names:
+        gain = gain * numpyro.deterministic("path_share", paths.mask.astype(float))
+    gain = numpyro.deterministic("path_gain", gain)
     delay = numpyro.deterministic("path_delay", paths.delay)
     departure = numpyro.deterministic("departure", paths.departure)
     arrival = numpyro.deterministic("arrival", paths.arrival)

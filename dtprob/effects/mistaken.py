@@ -12,7 +12,7 @@ import numpy as np
 
 from dtprob.effects.common import Data, Family, Sites, band, normal, of_model, offers
 from dtprob.effects.effect import Effect
-from dtprob.effects.solver import gain_beyond
+from dtprob.raytracing.beyond import only
 from dtprob.raytracing.paths import PathSet
 
 _SAME_PLACE: Final = 1e-3
@@ -27,7 +27,7 @@ def place_name(number: int) -> str:
 def swapped_transmitters(sites: Sites, data: Data) -> list[Effect]:
     """Two transmitters' places are taken for one another."""
     paths: PathSet | None = data.get("paths")
-    if paths is None or not offers(sites, "path_gain", "permittivity", "conductivity"):
+    if paths is None or not offers(sites, "path_share"):
         return []
     places = np.unique(np.asarray(paths.tx_position), axis=0)
     pairs = combinations(range(len(places)), 2)
@@ -35,13 +35,13 @@ def swapped_transmitters(sites: Sites, data: Data) -> list[Effect]:
     return [
         Effect(
             "swapped_transmitters",
-            {"path_gain": _swapped(places, first, second)},
+            {"path_share": _swapped(places, first, second)},
             (normal("share", 0.7),),
             instance=f"{first}_{second}",
             physics=f"Links of the transmitters at {_text(places[first])} and at {_text(places[second])} are really those"
             " of the other: this share of the amplitude of the other's paths, the rest of the own.",
             source="(1 - s) a_own + s a_other.",
-            requires=("paths", "permittivity", "conductivity"),
+            requires=("paths",),
         )
         for first, second in pairs
         if {place_name(first), place_name(second)} <= known
@@ -52,7 +52,7 @@ def _swapped(places: np.ndarray, first: int, second: int) -> Any:
     def swap(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
         for own, other in ((first, second), (second, first)):
             here = _at(context["paths"], places[own])[:, None]
-            value = value + p["share"] * here * (gain_beyond(place_name(other), context) - value)
+            value = value + p["share"] * here * (only(context["paths"], place_name(other)) - value)
         return value
 
     return swap

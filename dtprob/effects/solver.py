@@ -1,7 +1,7 @@
 """The gap may be the tool's: what the ray tracer was told to leave out, and the law that it takes for a wall.
 
 Paths that a fuller trace finds ride along in the path set, masked (`dtprob.raytracing.beyond`); an effect
-switches their amplitude on.
+raises their share of the amplitude.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Complex
 
 from dtprob.effects.common import Data, Family, Sites, normal, offers
 from dtprob.effects.effect import Effect
@@ -24,7 +23,6 @@ DEPTH: Final = "depth"
 """Name of the paths that are found with more interactions than the twin allows."""
 REFRACTION: Final = "refraction"
 """Name of the paths that are found through walls where the twin lets none through."""
-_NEEDS: Final = ("paths", "permittivity", "conductivity")
 
 
 def depth_cut_off(sites: Sites, data: Data) -> list[Effect]:
@@ -70,39 +68,29 @@ def wall_law(sites: Sites, data: Data) -> list[Effect]:
             physics=f"This share of the way from the twin's law of a wall to that of a {other.replace('_', ' ')},"
             " in amplitude.",
             source="ITU-R P.2040: Fresnel coefficients, with or without all internal reflections.",
-            requires=_NEEDS,
+            requires=("paths", "permittivity", "conductivity"),
         )
     ]
-
-
-def gain_beyond(name: str, context: Mapping[str, Any]) -> Complex[Array, "link path"]:
-    """Gains of the paths that another trace has, 0 for all others, with the model's materials.
-
-    Args:
-        name: of the trace.
-        context: data and sites by name.
-    """
-    return _gain(only(context["paths"], name), context)
 
 
 def _switched_on(family: str, sites: Sites, data: Data, *, name: str, text: str, source: str) -> list[Effect]:
     paths: PathSet | None = data.get("paths")
     if paths is None or name not in paths.beyond_names:
         return []
-    if not offers(sites, "path_gain", "permittivity", "conductivity"):
+    if not offers(sites, "path_share"):
         return []
 
     def add(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        return value + p["share"] * gain_beyond(name, context)
+        return value + p["share"] * only(context["paths"], name)
 
     return [
         Effect(
             family,
-            {"path_gain": add},
+            {"path_share": add},
             (normal("share", 0.7),),
             physics=f"Paths with {text} count with this share of their amplitude; 1 is what a fuller trace says.",
             source=source,
-            requires=_NEEDS,
+            requires=("paths",),
         )
     ]
 

@@ -14,6 +14,7 @@ from numpyro.distributions import constraints, transforms
 from dtprob.errors import InputError
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.raytracing import field
+from dtprob.raytracing.beyond import with_all
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.slab import Law
 
@@ -25,6 +26,7 @@ AXES = {
     "permittivity": ("object",),
     "conductivity": ("object",),
     "thickness": ("object",),
+    "path_share": ("link", "path"),
     "path_gain": ("link", "path"),
     "path_delay": ("link", "path"),
     "departure": ("link", "path", "direction"),
@@ -110,6 +112,9 @@ def _about(name: str, centre: jax.Array) -> jax.Array:
 def traced_gain(paths: PathSet, materials: Materials, law: Law) -> Complex[Array, "link path"]:
     """The site `path_gain` and, before it, those of what the objects are made of.
 
+    Where the path set keeps paths of other traces, the site `path_share` comes before it, too: 1 for the twin's own paths,
+    0 for the others, in amplitude. What an effect lets in there is then weakened like any other path.
+
     Args:
         paths: propagation paths of each link.
         materials: which permittivities and conductivities are unknown.
@@ -119,7 +124,10 @@ def traced_gain(paths: PathSet, materials: Materials, law: Law) -> Complex[Array
     permittivity = site("permittivity", permittivity)
     conductivity = site("conductivity", conductivity)
     thickness = site("thickness", jnp.asarray(paths.thickness))
-    return site("path_gain", field.path_gain(paths, permittivity, conductivity, thickness=thickness, law=law))
+    gain = field.path_gain(with_all(paths), permittivity, conductivity, thickness=thickness, law=law)
+    if paths.beyond_names:
+        gain = gain * site("path_share", paths.mask.astype(float))
+    return site("path_gain", gain)
 
 
 def unknown_phase() -> dist.VonMises:

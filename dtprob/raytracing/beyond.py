@@ -1,7 +1,7 @@
 """Paths that a twin has not but another trace of it has: kept apart in the twin's own path set.
 
 A fuller solver finds paths that the twin cut off; a link whose transmitter stands where another is recorded has
-other paths altogether. Such paths ride along masked, so that no model sums them, until an effect asks for them.
+other paths altogether. Such paths ride along masked, so that no model sums them, until an effect raises their share.
 """
 
 import dataclasses
@@ -81,8 +81,8 @@ def with_beyond(
     return dataclasses.replace(paths, **joined, beyond_names=(*paths.beyond_names, name))
 
 
-def only(paths: PathSet, name: str) -> PathSet:
-    """The path set with the paths of one other trace unmasked and all others masked.
+def only(paths: PathSet, name: str) -> Bool[Array, "link path"]:
+    """Which paths only one other trace has.
 
     Args:
         paths: a path set that has such paths.
@@ -93,8 +93,14 @@ def only(paths: PathSet, name: str) -> PathSet:
     """
     if name not in paths.beyond_names or paths.beyond is None:
         raise unknown_name("paths beyond the twin", name, paths.beyond_names, "trace")
-    chosen = paths.beyond == paths.beyond_names.index(name) + 1
-    return eqx.tree_at(lambda p: p.mask, paths, chosen)
+    return paths.beyond == paths.beyond_names.index(name) + 1
+
+
+def with_all(paths: PathSet) -> PathSet:
+    """The path set with the paths of other traces unmasked beside its own."""
+    if paths.beyond is None:
+        return paths
+    return eqx.tree_at(lambda p: p.mask, paths, paths.mask | (paths.beyond > 0))
 
 
 def _power(paths: PathSet) -> Float[np.ndarray, "link path"]:

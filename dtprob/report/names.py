@@ -28,6 +28,7 @@ _CAPITALS = {
     "csi": "CSI",
 }
 _SITES = {
+    "path_share": "which paths there are",
     "path_gain": "path gains",
     "path_delay": "path delays",
     "path_phase": "path phases",

@@ -22,6 +22,8 @@ def expect(condition: object, what: str, expected: str, got: object, remedy: str
 
 
 def same(first: object, second: object) -> bool:
-    """Whether two arrays agree in shape, type and every bit."""
+    """Whether two arrays agree in shape, type and every value, without rounding; zeros of either sign are one value."""
     a, b = np.asarray(first), np.asarray(second)
-    return a.shape == b.shape and a.dtype == b.dtype and a.tobytes() == b.tobytes()
+    if a.shape != b.shape or a.dtype != b.dtype:
+        return False
+    return a.tobytes() == b.tobytes() or np.array_equal(a, b)

@@ -94,7 +94,8 @@ def test_path_phases_of_the_model_are_no_effect(world):
 
 
 def test_powers_alone_offer_no_phases(world):
-    sites = {n: world.sites[n] for n in ("permittivity", "conductivity", "path_gain", "departure", "arrival")}
+    names = ("permittivity", "conductivity", "path_share", "path_gain", "departure", "arrival")
+    sites = {n: world.sites[n] for n in names}
     effects = catalogue(sites, world.data)
     offered = {effect.family for effect in effects}
     assert offered == {

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from numpyro import handlers
 
-from dtprob.effects import Rewriting, catalogue
+from dtprob.effects import Rewriting, catalogue, with_effects
 from dtprob.errors import InputError
-from dtprob.raytracing.beyond import only, share_kept, strongest, with_beyond
+from dtprob.raytracing.beyond import only, share_kept, strongest, with_all, with_beyond
 from dtprob.raytracing.field import path_gain
 from dtprob.testing import check_effect
 from tests import small_world
@@ -19,15 +19,15 @@ from tests import small_world
 PLACES = np.array([[0.0, 0.0, 0.0], [0.0, 0.0, 0.0], [1.0, -0.5, 0.3]])
 
 
-def sites_of(world, name=None, **parameters):
-    """Values of all sites of the world with an effect, or without one."""
+def sites_of(world, name=None, also=None, **parameters):
+    """Values of all sites of the world with an effect, or without one; `also` gives latent sites."""
     chosen = [] if name is None else list(catalogue(world.sites, world.data, [name]))
     given = {e.name: {k: jnp.asarray(v, float) for k, v in parameters.items()} for e in chosen}
     with (
         handlers.trace() as trace,
         Rewriting(None, chosen, given, world.data),
         handlers.seed(rng_seed=0),
-        handlers.substitute(data={"scale": jnp.ones(())}),
+        handlers.substitute(data={"scale": jnp.ones(()), **(also or {})}),
     ):
         world.model(**world.data)
     return {n: np.asarray(m["value"]) for n, m in trace.items() if m["type"] == "deterministic"}
@@ -49,6 +49,17 @@ def test_a_cut_off_path_comes_back_whole(world, name, there):
     change = sites_of(world, name, share=1.0)["path_gain"] - sites_of(world)["path_gain"]
     assert np.flatnonzero(change.ravel()).tolist() == [there[0] * 7 + there[1]]
     np.testing.assert_allclose(change[there], gain(full)[there], rtol=1e-6)
+
+
+def test_what_is_known_of_reflections_holds_for_paths_of_another_trace(world):
+    """A cut-off path of two reflections comes back as weak as the twin's other reflections are known to be."""
+    (known,) = catalogue(world.sites, world.data, ["missing_path[reflection]"])
+    extended = dataclasses.replace(world, model=with_effects(world.model, [known]))
+    weak = {"missing_path[reflection].fraction": jnp.asarray(0.75)}
+    plain_gain = sites_of(world, "depth_cut_off", share=1.0)["path_gain"]
+    found = sites_of(extended, "depth_cut_off", also=weak, share=1.0)["path_gain"]
+    np.testing.assert_allclose(found[1, 5], 0.25 * plain_gain[1, 5], rtol=1e-6)
+    assert abs(plain_gain[1, 5]) > 0
 
 
 def test_the_other_law_of_a_wall(world):
@@ -158,9 +169,9 @@ def test_another_trace_adds_only_what_is_new():
     joined = with_beyond(paths, "more", whole, 4)
     np.testing.assert_allclose(gain(joined)[:, :7], gain(paths))
     assert not gain(joined)[:, 7:].any()
-    assert int(np.sum(np.asarray(only(joined, "more").mask))) == 2
+    assert int(np.sum(np.asarray(only(joined, "more")))) == 2
     np.testing.assert_allclose(
-        np.sort(np.abs(gain(only(joined, "more"))[joined.beyond > 0])),
+        np.sort(np.abs(gain(with_all(joined))[joined.beyond > 0])),
         np.sort(np.abs(gain(whole)[small_world.BEYOND > 0])),
         rtol=1e-6,
     )
