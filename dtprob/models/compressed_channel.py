@@ -22,7 +22,7 @@ from numpyro import handlers
 from dtprob.errors import InputError
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
-from dtprob.models.scene import AXES, Materials, site, traced_gain, unknown_noise_power, unknown_phase
+from dtprob.models.scene import AXES, TRACED, Materials, site, traced_gain, unknown_noise_power, unknown_phase
 from dtprob.raytracing.calibration import Statistics, project
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.slab import Law
@@ -33,7 +33,7 @@ type PathPhase = Literal["coherent", "per_packet", "per_path"]
 _SMALLEST: Final = 1e-9
 """Directions of the paths' span whose part of the Gram matrix is smaller than this share of the largest are noise."""
 _AXES: Final = {
-    **{name: AXES[name] for name in ("permittivity", "conductivity", "thickness", "path_gain")},
+    **{name: AXES[name] for name in TRACED},
     "path_phase": AXES["path_phase"],
     "path_power": ("link", "path"),
 }

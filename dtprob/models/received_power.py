@@ -20,13 +20,13 @@ from jaxtyping import Array, Float
 
 from dtprob.errors import InputError
 from dtprob.models.declaration import model
-from dtprob.models.scene import AXES, Materials, site, traced_gain
+from dtprob.models.scene import AXES, TRACED, Materials, site, traced_gain
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.slab import Law
 
 POWER_AXES: Final = ("link", "rx_antenna", "tx_antenna")
 _AXES: Final = {
-    **{name: AXES[name] for name in ("permittivity", "conductivity", "thickness", "path_gain")},
+    **{name: AXES[name] for name in TRACED},
     "path_power": ("link", "path"),
     "mean_power": ("link",),
     "fading_deviation": ("link",),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +38,9 @@ AXES = {
     "noiseless_channel": CHANNEL_AXES,
     "noise_power": CHANNEL_AXES,
 }
+
+TRACED: Final = ("permittivity", "conductivity", "thickness", "path_share", "path_gain")
+"""Sites of `traced_gain`."""
 
 
 def channel_shape(

@@ -21,7 +21,7 @@ from jaxtyping import Array, Float
 from dtprob.data.kinds import ChannelData
 from dtprob.errors import InputError
 from dtprob.models.declaration import model
-from dtprob.models.scene import AXES, Materials, site, traced_gain
+from dtprob.models.scene import AXES, TRACED, Materials, site, traced_gain
 from dtprob.models.ultra_wideband.receiver import (
     GAIN_SPREAD,
     RANGING_SPREAD,
@@ -36,17 +36,8 @@ from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.phasor import phasor
 from dtprob.raytracing.slab import Law
 
-_TRACED: Final = (
-    "permittivity",
-    "conductivity",
-    "thickness",
-    "path_gain",
-    "path_delay",
-    "departure",
-    "arrival",
-)
 _AXES: Final = {
-    **{name: AXES[name] for name in _TRACED},
+    **{name: AXES[name] for name in (*TRACED, "path_delay", "departure", "arrival")},
     "path_power": ("link", "path"),
     "receiver_delay": ("link",),
     "receiver_gain": ("link",),
