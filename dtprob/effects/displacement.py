@@ -119,7 +119,7 @@ def object_rotation(sites: Sites, data: Data) -> list[Effect]:
                 unfolding.rewrites(sites, shift),
                 (normal("rotation", _TURN, "rad", len(basis)),),
                 instance=name,
-                physics=f"{name} is turned about the centre of its reflections, around {along(basis)}.",
+                physics=f"{name} is turned about its centre, around {along(basis)}.",
                 source="d = omega x (v - c) at each point of reflection; " + _IMAGE,
                 requires=("paths",),
             )
@@ -201,10 +201,16 @@ def _normals(paths: PathSet, index: int) -> np.ndarray:
 
 
 def _levers(paths: PathSet, index: int) -> tuple[np.ndarray, np.ndarray]:
-    """Centre c of an object's points of reflection v, (3,), and the levers (v - c) x n of a turn, (n, 3)."""
+    """Centre c of an object and the levers (v - c) x n of a turn, (n, 3), for each of its points of reflection v.
+
+    The centre is that of its points of reflection where the path set does not say how far the object reaches.
+    """
     chosen = _reflections(paths, index)
     points = np.asarray(paths.vertex)[chosen]
-    centre = points.mean(axis=0) if len(points) else np.zeros(3)
+    if paths.object_center is not None:
+        centre = np.asarray(paths.object_center)[index]
+    else:
+        centre = points.mean(axis=0) if len(points) else np.zeros(3)
     return centre, np.cross(points - centre, np.asarray(paths.normal)[chosen]).reshape(-1, 3)
 
 

@@ -134,6 +134,7 @@ def assemble(
             frequency=frequency,
             object_names=objects.names,
             material_names=objects.material_names,
+            object_center=jnp.asarray(objects.center),
             scattering=jnp.asarray(objects.scattering) if np.any(objects.scattering) else None,
             provenance=_provenance(objects, antennas, settings),
         )

@@ -55,6 +55,7 @@ class PathSet(eqx.Module):
         material_names: names of its materials.
         scattering: scattering coefficient S per object, or None when all are 0; a specular reflection is
             weakened by sqrt(1 - S^2).
+        object_center: centre of each object's bounding box, in m; None where only its points of reflection are known.
         beyond: 0 for the paths of the set itself; k for paths that only another trace has, `beyond_names[k - 1]`. These
             are masked, as if missing, but their arrays hold true values (see `dtprob.raytracing.beyond`). None
             where there are none.
@@ -84,6 +85,7 @@ class PathSet(eqx.Module):
     object_names: tuple[str, ...] = eqx.field(static=True)
     material_names: tuple[str, ...] = eqx.field(static=True)
     scattering: Float[Array, " object"] | None = None
+    object_center: Float[Array, "object 3"] | None = None
     beyond: Int[Array, "link path"] | None = None
     beyond_names: tuple[str, ...] = eqx.field(static=True, default=())
     provenance: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
@@ -165,6 +167,7 @@ DIMENSIONS: Final[dict[str, tuple[str, ...]]] = {
     "conductivity": ("object",),
     "thickness": ("object",),
     "scattering": ("object",),
+    "object_center": ("object", "xyz"),
     "beyond": ("link", "path"),
 }
 """The axes of every array of a `PathSet`."""

@@ -43,7 +43,7 @@ class Traced(NamedTuple):
 
 
 class Objects(NamedTuple):
-    """The objects of a scene; `normal` lists the faces of all of them, object i from `first_face[i]` on."""
+    """The objects of a scene; `center`: of each bounding box; faces of object i begin in `normal` at `first_face[i]`."""
 
     names: tuple[str, ...]
     identifier: Int[np.ndarray, " object"]
@@ -53,6 +53,7 @@ class Objects(NamedTuple):
     conductivity: Float[np.ndarray, " object"]
     thickness: Float[np.ndarray, " object"]
     scattering: Float[np.ndarray, " object"]
+    center: Float[np.ndarray, "object 3"]
     first_face: Int[np.ndarray, " object"]
     normal: Float[np.ndarray, "face 3"]
     sha256: str
@@ -61,12 +62,13 @@ class Objects(NamedTuple):
 def describe_objects(scene: Any) -> Objects:
     """Read names, materials and the normals of all faces from a loaded scene."""
     digest = hashlib.sha256()
-    names, normals, values, used = [], [], [], []
+    names, normals, values, used, centres = [], [], [], [], []
     for name, item in scene.objects.items():
         corners = np.asarray(item.mi_mesh.vertex_positions_buffer()).reshape(-1, 3).astype(np.float64)
         faces = np.asarray(item.mi_mesh.faces_buffer()).reshape(-1, 3).astype(np.int64)
         names.append(name)
         normals.append(_face_normals(corners[faces]))
+        centres.append((corners.min(axis=0) + corners.max(axis=0)) / 2)
         values.append([_value(item.radio_material, key, default) for key, default in _PROPERTIES])
         used.append(item.radio_material.name)
         for part in (name.encode(), used[-1].encode(), corners.tobytes(), faces.tobytes()):
@@ -83,6 +85,7 @@ def describe_objects(scene: Any) -> Objects:
         table[:, 1],
         table[:, 2],
         table[:, 3],
+        np.asarray(centres, np.float64).reshape(-1, 3),
         np.cumsum([0, *map(len, normals)])[:-1],
         np.concatenate(normals) if normals else np.zeros((0, 3)),
         digest.hexdigest(),

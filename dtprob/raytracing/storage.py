@@ -16,7 +16,7 @@ from dtprob.raytracing.paths import DIMENSIONS, PathSet, validate
 
 FORMAT: Final = "dtprob.paths"
 FORMAT_VERSION: Final = 1
-_OPTIONAL: Final = frozenset({"scattering", "beyond"})
+_OPTIONAL: Final = frozenset({"scattering", "object_center", "beyond"})
 _REMEDY: Final = "Trace the scene again and save the path set with this version of dtprob"
 
 

@@ -96,16 +96,23 @@ def test_displaced_path_keeps_the_free_space_law(world, apply):
     assert np.allclose(weakened, (after["path_delay"] / before["path_delay"])[mask], rtol=1e-9)
 
 
-def test_rotated_object_is_right_to_first_order(world, apply):
-    """A plane turned about a point of it: image the transmitter in the turned plane."""
+@pytest.mark.parametrize("middle", [None, (0.0, 3.0, -1.0)])
+def test_rotated_object_is_right_to_first_order(world, apply, middle):
+    """A plane turned about a point, its object's middle if that is known: image the transmitter in the turned plane."""
     paths = world.data["paths"]
-    chosen = catalogue(world.sites, world.data, ["object_rotation[east]"])[0]
     at = (
         np.asarray(paths.mask)[..., None]
         & (np.asarray(paths.object) == 0)
         & (np.asarray(paths.interaction) == 1)
     )
     centre = np.asarray(paths.vertex)[at].mean(axis=0)
+    data = world.data
+    if middle is not None:
+        centre = centre + middle
+        centers = np.zeros((paths.n_object, 3))
+        centers[0] = centre
+        data = {**data, "paths": dataclasses.replace(paths, object_center=jnp.asarray(centers))}
+    chosen = catalogue(world.sites, data, ["object_rotation[east]"])[0]
     errors = []
     for angle in (1e-3, 5e-4):
         turn = Rotation.from_rotvec([0, 0, angle]).as_matrix()
@@ -115,7 +122,7 @@ def test_rotated_object_is_right_to_first_order(world, apply):
         exact = np.linalg.norm(rx - image, axis=1) / SPEED
         assert chosen.dimension == 2
         assert "(0.00 1.00 0.00), (0.00 0.00 1.00)" in chosen.physics
-        found = apply("object_rotation[east]", rotation=[0.0, angle])["path_delay"][:, 1]
+        found = apply("object_rotation[east]", data=data, rotation=[0.0, angle])["path_delay"][:, 1]
         errors.append(np.max(np.abs(found - exact)))
         assert errors[-1] < 0.05 * np.max(np.abs(exact - np.asarray(paths.delay)[:, 1]))
     assert errors[1] < 0.3 * errors[0]

@@ -41,12 +41,17 @@ def test_round_trip(box, stored):
         assert np.array_equal(one, other)
 
 
-def test_complex_fields_and_scattering(box, tmp_path):
-    other = dataclasses.replace(box, tx_field=box.tx_field * (1 + 2j), scattering=jnp.full(7, 0.3))
+def test_complex_fields_and_what_need_not_be_there(box, tmp_path):
+    middle = jnp.arange(21.0).reshape(7, 3)
+    scattering = jnp.full(7, 0.3)
+    other = dataclasses.replace(
+        box, tx_field=box.tx_field * (1 + 2j), scattering=scattering, object_center=middle
+    )
     save(other, tmp_path / "p.nc")
     again = load(tmp_path / "p.nc")
     assert np.array_equal(again.tx_field, other.tx_field)
     assert np.array_equal(again.scattering, other.scattering)
+    assert np.array_equal(again.object_center, middle)
 
 
 def test_readable_without_the_ray_tracer(box, stored):

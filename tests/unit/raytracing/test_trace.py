@@ -115,6 +115,8 @@ def test_a_valid_set_that_says_where_it_comes_from(street, places):
     found = dict(paths.provenance)
     assert found["max_depth"] == "3"
     assert len(found["scene_sha256"]) == 64
+    turned_about = [np.asarray(street.objects[name].position).reshape(3) for name in paths.object_names]
+    assert np.allclose(paths.object_center, turned_about, atol=1e-4)
     turns = np.asarray(paths.delay) * 28e9
     assert np.max(np.abs(paths.carrier_phasor - np.exp(-2j * np.pi * (turns % 1)))) < 1e-9
     assert np.all(np.diff(np.where(paths.mask, paths.length, np.inf)[:, :2], axis=1) > 0)
