@@ -181,7 +181,7 @@ def _remainder(evidence: Evidence) -> dict[str, Any] | None:
 
 
 def _screening(evidence: Evidence) -> list[dict[str, Any]]:
-    first = evidence.steps[0].view.screening
+    first, refitted = evidence.steps[0].view.screening, evidence.steps[0].trials.fits
     effects = {e.name: e for e in evidence.problem.effects}
     order = np.argsort(
         first.adjusted + 1e-3 * (1 - np.clip(first.log_bayes_factor / 1e3, 0, 1)), kind="stable"
@@ -194,7 +194,7 @@ def _screening(evidence: Evidence) -> list[dict[str, Any]]:
             "z": first.z[i],
             "p_value": first.p_value[i],
             "adjusted_p_value": first.adjusted[i],
-            "absorbed_by": first.absorbed_by[i],
+            "absorbed_by": None if first.names[i] in refitted else first.absorbed_by[i],
         }
         for i in map(int, order)
     ]

@@ -17,7 +17,7 @@ from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
-from dtprob.gap.which.scan import Found, scan, scan_anew
+from dtprob.gap.which.scan import Found, scan, scan_anew, scan_anew_about_centre
 
 type Say = Callable[[str], None]
 
@@ -39,6 +39,10 @@ _WORTH: Final = 3.0
 """Nats that an effect has to gain in a scan."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
+_LOOKS: Final = (scan, scan_anew, scan_anew_about_centre)
+"""Scans, where scores may miss it."""
+_AT_FIT: Final = _LOOKS.index(scan_anew)
+"""That of whole sizes at the fit. What gains there is no move of a nuisance, which the fit would have made."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ def tried(
     scans: list[dict[str, Found]] = []
     if not fitted.effects and seen.promise > _LARGE_GAP:
         say("scanning the effects' plausible sizes")
-        scans = [look(seen.problem, seen.fitted.x, screening.names) for look in (scan, scan_anew)]
+        scans = [look(seen.problem, seen.fitted.x, screening.names) for look in _LOOKS]
     chosen = [n for n in _chosen(seen, scans, settings, banned) if n not in known]
     problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
@@ -165,10 +169,13 @@ def _chosen(
     Scans do not start from the same likelihood, so their gains cannot be compared.
     """
     screening = seen.screening
+    at_fit = scans[_AT_FIT] if scans else {}
     able = [
         i
         for i, name in enumerate(screening.names)
-        if screening.absorbed_by[i] is None and name != banned and _affordable(seen.problem, name)
+        if (screening.absorbed_by[i] is None or (name in at_fit and at_fit[name].gain > _WORTH))
+        and name != banned
+        and _affordable(seen.problem, name)
     ]
     gain = screening.log_bayes_factor
     least = _HOPELESS * max((gain[i] for i in able), default=0.0)

@@ -16,7 +16,7 @@ from dtprob.gap.fitting.refit import starting_points
 from dtprob.gap.fitting.sweep import elsewhere, swept, turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.which.scan import scan, scan_anew
+from dtprob.gap.which.scan import scan, scan_anew, scan_anew_about_centre
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
 
@@ -177,6 +177,41 @@ def test_what_needs_the_links_found_anew_is_seen_by_the_scan():
     assert np.isclose(found.gain, terms.sum() - unswapped.sum(), rtol=1e-6)
     linear = Problem(levels, {"y": jnp.asarray(power)}, [])
     assert elsewhere(linear, linear.start({"level": np.zeros((5, 1))}), linear.compiled.by_cluster) == []
+
+
+@model(cluster="link", axes={"amplitude": ("pulse",), "power": ("link", "tap")})
+def silenced(links, y=None):
+    """All pulses have a loudness and a spread of their own; one of noise is shared, too."""
+    amplitude = numpyro.deterministic("amplitude", jnp.array([1.0, 1.0, 0.0, 0.0]))
+    all_loud = numpyro.sample("all_loud", dist.Normal(0.0, 2.0))
+    noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
+    with numpyro.plate("link", links, dim=-2):
+        late = numpyro.sample("late", dist.Normal(0.0, 1.0))
+        apart = (TAPS - late)[..., None] - PULSES
+        pulses = jnp.exp(-0.5 * (apart / 0.2) ** 2) @ amplitude
+        power = numpyro.deterministic("power", jnp.exp(all_loud) * pulses)
+        with numpyro.plate("tap", len(TAPS), dim=-1):
+            numpyro.sample("y", dist.Normal(power, noise), obs=y)
+
+
+def test_what_the_fit_has_silenced_is_seen_about_the_priors_centre():
+    late = LATE / 4
+    noise = NOISE * np.random.default_rng(5).normal(size=(len(late), len(TAPS)))
+    power = elsewhere_pulses(late, np.zeros(len(late))) / WEAKER
+    swap = Effect(
+        "swap",
+        {"amplitude": lambda value, p, _: value + p["share"] * (value[::-1] - value)},
+        swap_size("share"),
+    )
+    problem = Problem(silenced, {"links": len(late), "y": jnp.asarray(power + noise)}, [swap])
+    start = {"late": np.zeros((5, 1)), "all_loud": np.array(-4.0), "noise": np.array(0.5)}
+    x = fitting.fit(problem, problem.start(start)).x
+    assert x[problem.layout["all_loud"].index[0]] < -2.0
+    assert "swap" not in scan(problem, x, ["swap"])
+    assert "swap" not in scan_anew(problem, x, ["swap"])
+    found = scan_anew_about_centre(problem, x, ["swap"])["swap"]
+    assert found.gain > 20
+    np.testing.assert_allclose(found.parameters, [1.0])
 
 
 @model(cluster="link")

@@ -42,3 +42,10 @@ def test_what_gains_nothing_or_is_absorbed_is_not_refitted():
     scans = [{"wall": 2.0, "tilt": np.inf}, {}]
     assert chosen({"near": 90.0, "far": 1.0}, scans, 6, absorbed=("tilt",)) == ["near"]
     assert chosen({}, [], 6) == []
+
+
+def test_what_gains_at_its_whole_size_at_the_fit_is_not_absorbed():
+    fit, anew, centre = {"wall": 90.0}, {"tilt": 50.0, "swap": 2.0}, {"drift": 90.0}
+    absorbed = ("wall", "tilt", "swap", "drift")
+    assert chosen({"near": 90.0}, [fit, anew, centre], 6, absorbed) == ["near", "tilt"]
+    assert chosen({"near": 90.0}, [fit, anew, centre], 6) == ["near", "wall", "tilt", "drift"]
