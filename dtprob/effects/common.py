@@ -145,7 +145,7 @@ def band(data: Data) -> Band | None:
     return Band((low + high) / 2, high - low, values.size)
 
 
-def legendre(x: Float[Array, " n"], orders: Sequence[int]) -> Float[Array, "n order"]:
+def legendre(x: Float[Array, "*n"], orders: Sequence[int]) -> Float[Array, "*n order"]:
     """Legendre polynomials P_order(x) on [-1, 1]."""
     columns = [
         jnp.polyval(jnp.asarray(np.polynomial.legendre.leg2poly(np.eye(order + 1)[order])[::-1]), x)

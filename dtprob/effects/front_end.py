@@ -102,9 +102,9 @@ def frequency_response(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "frequency_response",
                 {"frequency_response": lambda value, p, context: value * _smooth(measured, p, context)},
-                (normal("log_gain", 0.1, "Np", 4), normal("phase", 0.1, "rad", 3)),
-                physics="Smooth response of the whole chain, without a constant and without a delay.",
-                source="exp(sum_n a_n P_n(x) + j sum_m b_m P_m(x)), Legendre, n = 1..4, m = 2..4.",
+                (normal("log_gain", 0.1, "Np", 5), normal("phase", 0.1, "rad", 4)),
+                physics="Smooth response of the whole chain, its mean gain and its delay included.",
+                source="exp(sum_n a_n P_n(x) + j sum_m b_m P_m(x)), Legendre, n = 0..4, m = 1..4.",
                 requires=("subcarrier_frequency",),
             )
         )
@@ -118,7 +118,7 @@ def frequency_response(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "frequency_response",
                 {"noiseless_channel": weigh},
-                (normal("log_gain", 0.1, "Np", 4), normal("phase", 0.1, "rad", 3)),
+                (normal("log_gain", 0.1, "Np", 5), normal("phase", 0.1, "rad", 4)),
                 instance=name,
                 physics=f"Smooth response of the chain of receiving antenna {index} alone.",
                 source="As for the whole chain.",
@@ -132,8 +132,8 @@ def _smooth(
     measured: Band, p: Mapping[str, Any], context: Mapping[str, Any]
 ) -> Complex[Array, " subcarrier"]:
     x = measured.position(context["subcarrier_frequency"])
-    gain = legendre(x, range(1, 5)) @ p["log_gain"]
-    return jnp.exp(gain) * phasor(legendre(x, range(2, 5)) @ p["phase"])
+    gain = legendre(x, range(5)) @ p["log_gain"]
+    return jnp.exp(gain) * phasor(legendre(x, range(1, 5)) @ p["phase"])
 
 
 def frequency_ripple(sites: Sites, data: Data) -> list[Effect]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import jax
@@ -18,6 +18,7 @@ from dtprob.effects.common import (
     complex_of,
     half_normal,
     has_phase,
+    legendre,
     n_link,
     n_snapshot,
     normal,
@@ -123,29 +124,34 @@ def antenna_pattern(sites: Sites, data: Data) -> list[Effect]:
     if not offers(sites, "path_gain") or data.get("paths") is None:
         return []
     return [
-        _pattern(side, name, columns, text)
+        _pattern(side, f"{side}{part}", over, text)
         for side in SIDES
-        for name, columns, text in (
-            (side, list(range(8)), "x, y, z, xy, yz, zx, x^2 - y^2, 3 z^2 - 1"),
-            (f"{side}_elevation", [2, 7], "z, 3 z^2 - 1, as of a dipole for another one"),
+        for part, over, text in (
+            ("", _harmonics, "x, y, z, xy, yz, zx, x^2 - y^2, 3 z^2 - 1"),
+            (
+                "_elevation",
+                lambda k: _harmonics(k)[..., jnp.array([2, 7])],
+                "z, 3 z^2 - 1, a dipole for another",
+            ),
+            ("_vertical_cut", _vertical_cut, "P_n(z), n = 0..6, its mean gain included"),
         )
     ]
 
 
-def _pattern(side: str, instance: str, columns: list[int], text: str) -> Effect:
-    """A pattern made of some of the harmonics."""
+def _pattern(side: str, instance: str, over: Callable[[jax.Array], jax.Array], text: str) -> Effect:
+    """A log gain made of some functions of the direction of travel."""
 
     def weigh(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        direction = getattr(context["paths"], DIRECTION[side])
-        return value * jnp.exp(_harmonics(direction)[..., jnp.asarray(columns)] @ p["log_gain"])
+        return value * jnp.exp(over(getattr(context["paths"], DIRECTION[side])) @ p["log_gain"])
 
+    count = over(jnp.zeros((1, 3))).shape[-1]
     return Effect(
         "antenna_pattern",
         {"path_gain": weigh},
-        (normal("log_gain", 0.15, "Np", len(columns)),),
+        (normal("log_gain", 0.15, "Np", count),),
         instance=instance,
         physics=f"Log gain of all {side} antennas over the direction of travel k, in world axes: {text}.",
-        source="Real spherical harmonics of degree 1 and 2, of unit mean square over the sphere.",
+        source="Spherical harmonics of degree 1 and 2, or zonal ones up to degree 6, of unit mean square over the sphere.",
         requires=("paths",),
     )
 
@@ -195,13 +201,19 @@ def _has_path_phases(sites: Sites) -> bool:
     return any(s.kind == "latent" and s.is_circular and "path" in s.axes for s in sites.values())
 
 
-def _harmonics(direction: Float[Array, "link path 3"]) -> jax.Array:
-    """Real spherical harmonics of degree 1 and 2, of unit mean square, (link, path, 8)."""
+def _harmonics(direction: Float[Array, "*n 3"]) -> jax.Array:
+    """Real spherical harmonics of degree 1 and 2, of unit mean square, (*n, 8)."""
     x, y, z = direction[..., 0], direction[..., 1], direction[..., 2]
     first, second = 3**0.5, 15**0.5
     terms = [first * x, first * y, first * z, second * x * y, second * y * z, second * z * x]
     terms += [second / 2 * (x**2 - y**2), 5**0.5 / 2 * (3 * z**2 - 1)]
     return jnp.stack(terms, axis=-1)
+
+
+def _vertical_cut(direction: Float[Array, "*n 3"]) -> jax.Array:
+    """Zonal harmonics of degree 0 to 6, of unit mean square, (*n, 7)."""
+    orders = range(7)
+    return legendre(direction[..., 2], orders) * jnp.sqrt(2.0 * jnp.array(orders) + 1.0)
 
 
 FAMILIES: Final[dict[str, Family]] = {

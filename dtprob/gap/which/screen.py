@@ -49,6 +49,7 @@ class Screening:
         absorbed_by: the nuisance that hides the candidate, if one does.
         detectable: size along the best-determined direction that would be noticed nine times in ten.
         correlation: of the candidates' scores after adjustment; aliases are near +-1.
+        locates: whether a candidate says how the expected observations move, not only how they spread.
         replicate_p: smallest p-value over all candidates in each bootstrap replicate.
         scores: of the mean effects among them.
     """
@@ -62,6 +63,7 @@ class Screening:
     absorbed_by: tuple[str | None, ...]
     detectable: np.ndarray
     correlation: np.ndarray
+    locates: tuple[bool, ...]
     replicate_p: np.ndarray
     scores: Scores
 
@@ -120,6 +122,7 @@ def screen(
         absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),
         detectable=np.array([_detectable(scores, c, settings) for c in candidates]),
         correlation=_correlation(candidates, scores),
+        locates=tuple(c.name in scores.locating for c in candidates),
         replicate_p=replicate_p,
         scores=scores,
     )
@@ -129,7 +132,8 @@ def screen(
 class Scores:
     """Adjusted scores of mean effects: u of the data and of the replicates, information, and what was projected away.
 
-    `price` is what the best of many places costs each effect, in nats.
+    `price` is what the best of many places costs each effect, in nats; `locating` are the effects most of whose
+    information is in the location of observations, not in their spread.
     """
 
     effects: tuple[Effect, ...]
@@ -140,6 +144,7 @@ class Scores:
     total: np.ndarray
     coefficients: np.ndarray
     price: np.ndarray
+    locating: frozenset[str]
 
     def part(self, k: int) -> np.ndarray:
         """Information of one effect's own parameters."""
@@ -189,6 +194,8 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
     """
     information, coefficients = projection.information(found.columns)
     total = np.einsum("cmi,cmi->i", found.columns, found.columns)
+    located = problem.rows.by_cluster(problem.rows.located)[..., None] > 0
+    of_location = np.einsum("cmi,cmi->i", found.columns, np.where(located, found.columns, 0.0))
     u = _products(projection.adjoint(drawn.raw), found)
     values = problem.observed_values
     for effect, group in zip(found.effects, found.groups, strict=True):
@@ -199,8 +206,12 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
             u[group] += extra.score(values[extra.site][None])[0]
     u_null = np.concatenate([_replicate_scores(projection, found, *portion) for portion in drawn.portions()])
     information = (information + information.T) / 2
-    free = np.zeros(len(found.effects))
-    return Scores(found.effects, found.groups, u, u_null, information, total, np.asarray(coefficients), free)
+    pairs = zip(found.effects, found.groups, strict=True)
+    locating = frozenset(e.name for e, g in pairs if (2 * of_location[g] > total[g]).any())
+    free, coefficients = np.zeros(len(found.effects)), np.asarray(coefficients)
+    return Scores(
+        found.effects, found.groups, u, u_null, information, total, coefficients, free, locating=locating
+    )
 
 
 def _replicate_scores(

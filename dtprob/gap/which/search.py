@@ -107,13 +107,19 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
 def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
     """The pair that promises most to first order, if it promises more than one effect, and as much as was reached.
 
-    None where a way ended with it. First order understates: the base fit's spread holds the gap too.
+    None where a way ended with it. First order understates: the base fit's spread holds the gap too. It overstates what
+    noise explains, as which all of the gap counts at first: where what moves the mean leaves nothing, noise is no start.
     """
     seen = ways[0][0].view
     ends = [set(way[-1].view.fitted.effects) for way in ways]
     if settings.max_effects < 2 or not any(ends):
         return None
     pairs = seen.screening.scores.pairs()
+    locating = seen.screening.scores.locating
+    if any(
+        end <= locating and not way[-1].view.alarmed(settings) for end, way in zip(ends, ways, strict=True)
+    ):
+        pairs = tuple(pair for pair in pairs if locating.issuperset(pair.names))
     if not pairs:
         return None
     best = pairs[0]

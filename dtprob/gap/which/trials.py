@@ -164,9 +164,11 @@ def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Fo
 def _chosen(
     seen: View, scans: Sequence[Mapping[str, Found]], settings: Settings, banned: str | None
 ) -> list[str]:
-    """The best candidates by score and, in equal number, by the scans, of which each has its turn.
+    """The best candidates by score; where the gap is large, in turn with the best of two other lists.
 
-    Scans do not start from the same likelihood, so their gains cannot be compared.
+    One is of those that move what is expected: whatever is wrong looks like noise, which then has the largest scores. The
+    other is by the scans, which do not start from the same likelihood, so that their gains cannot be compared: each
+    has its turn.
     """
     screening = seen.screening
     at_fit = scans[_AT_FIT] if scans else {}
@@ -177,17 +179,28 @@ def _chosen(
         and name != banned
         and _affordable(seen.problem, name)
     ]
-    gain = screening.log_bayes_factor
-    least = _HOPELESS * max((gain[i] for i in able), default=0.0)
-    by_score = sorted((i for i in able if gain[i] > max(least, 0.0)), key=lambda i: -gain[i])
+    by_score = _promising(able, screening.log_bayes_factor)
+    if not scans:
+        return [screening.names[i] for i in by_score[: settings.candidates]]
     ranked = []
     for found in scans:
         gained = {i: found[screening.names[i]].gain for i in able if screening.names[i] in found}
         ranked.append(sorted((i for i in gained if gained[i] > _WORTH), key=lambda i: -gained[i]))
-    by_scan = list(dict.fromkeys(i for turn in itertools.zip_longest(*ranked) for i in turn if i is not None))
-    half = settings.candidates // 2
-    chosen = dict.fromkeys([*by_score[:half], *by_scan[:half], *by_score[half:], *by_scan[half:]])
-    return [screening.names[i] for i in list(chosen)[: settings.candidates]]
+    locating = _promising([i for i in able if screening.locates[i]], screening.log_bayes_factor)
+    chosen = _in_turn(by_score, locating, _in_turn(*ranked))
+    return [screening.names[i] for i in chosen[: settings.candidates]]
+
+
+def _promising(able: Sequence[int], gain: np.ndarray) -> list[int]:
+    """Candidates by falling gain, down to a share of the best one's."""
+    least = _HOPELESS * max((gain[i] for i in able), default=0.0)
+    return sorted((i for i in able if gain[i] > max(least, 0.0)), key=lambda i: -gain[i])
+
+
+def _in_turn(*lists: Sequence[int]) -> list[int]:
+    """The first of each list, then the second of each, and so on, each entry once."""
+    turns = itertools.zip_longest(*lists)
+    return list(dict.fromkeys(i for turn in turns for i in turn if i is not None))
 
 
 def _affordable(problem: Problem, name: str) -> bool:

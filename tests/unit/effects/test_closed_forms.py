@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpyro import handlers
 from scipy.spatial.transform import Rotation
+from scipy.special import eval_legendre
 
 from dtprob.effects import Rewriting, catalogue
 from dtprob.raytracing.field import path_gain
@@ -260,6 +261,15 @@ def test_near_field_is_the_sphere(world, apply):
         return np.max(np.abs(np.angle(np.exp(1j * (phase - sphere))))[np.asarray(paths.mask)])
 
     assert error(found) < 0.15 * error(flat)
+
+
+def test_a_vertical_cut_is_a_sum_of_zonal_harmonics(world, apply):
+    paths = world.data["paths"]
+    given = np.array([0.3, -0.2, 0.1, 0.05, -0.04, 0.03, 0.02])
+    found = apply("antenna_pattern[rx_vertical_cut]", log_gain=given)["path_gain"]
+    z = np.asarray(paths.arrival)[..., 2]
+    log_gain = sum(g * np.sqrt(2 * n + 1) * eval_legendre(n, z) for n, g in enumerate(given))
+    assert np.allclose(found, apply()["path_gain"] * np.exp(log_gain))
 
 
 def test_coupling_of_neighbours_on_a_line(apply):

@@ -1,4 +1,4 @@
-"""Which candidates are refitted: the best by score, and each scan's best in turn."""
+"""Which candidates are refitted: the best by score, of those that move the mean, and of each scan, in turn."""
 
 from types import SimpleNamespace
 from typing import Any, cast
@@ -20,10 +20,11 @@ def effect(name):
     )
 
 
-def chosen(scores, scans, count, absorbed=()):
+def chosen(scores, scans, count, absorbed=(), noise=()):
     screening = SimpleNamespace(
         names=NAMES,
         absorbed_by=["gain" if name in absorbed else None for name in NAMES],
+        locates=[name not in noise for name in NAMES],
         log_bayes_factor=np.array([scores.get(name, -1.0) for name in NAMES]),
     )
     problem = SimpleNamespace(effects=[effect(name) for name in NAMES])
@@ -34,8 +35,15 @@ def chosen(scores, scans, count, absorbed=()):
 
 def test_each_scan_has_its_turn_however_much_another_gains():
     scans = [{"wall": 50.0, "tilt": 40.0, "drift": 30.0}, {"swap": 20.0, "tilt": 10.0}]
-    assert chosen({"near": 90.0, "far": 80.0}, scans, 4) == ["near", "far", "wall", "swap"]
+    assert chosen({"near": 90.0, "far": 80.0}, scans, 4) == ["near", "wall", "far", "swap"]
     assert chosen({"near": 90.0}, scans, 6) == ["near", "wall", "swap", "tilt", "drift"]
+
+
+def test_what_looks_like_noise_leaves_room_for_what_moves_the_mean():
+    scores = {"near": 90.0, "far": 80.0, "swap": 70.0, "tilt": 8.0, "drift": 6.0}
+    noise = ("near", "far", "swap")
+    assert chosen(scores, [{"wall": 50.0}, {}], 5, noise=noise) == ["near", "tilt", "wall", "far", "drift"]
+    assert chosen(scores, [], 5, noise=noise) == ["near", "far", "swap", "tilt", "drift"]
 
 
 def test_what_gains_nothing_or_is_absorbed_is_not_refitted():
