@@ -19,7 +19,9 @@ def test_sizes(box):
 
 def test_names_are_static_and_arrays_are_leaves(box):
     leaves, structure = jax.tree.flatten(box)
-    assert len(leaves) == len(DIMENSIONS) - 2  # neither scattering nor other traces here
+    absent = {"scattering", "object_center", "beyond"}
+    assert {name for name in DIMENSIONS if getattr(box, name) is None} == absent
+    assert len(leaves) == len(DIMENSIONS) - len(absent)
     assert jax.tree.unflatten(structure, leaves).object_names == box.object_names
 
 
