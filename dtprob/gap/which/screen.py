@@ -194,8 +194,8 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
     """
     information, coefficients = projection.information(found.columns)
     total = np.einsum("cmi,cmi->i", found.columns, found.columns)
-    located = problem.rows.by_cluster(problem.rows.located)[..., None] > 0
-    of_location = np.einsum("cmi,cmi->i", found.columns, np.where(located, found.columns, 0.0))
+    located = np.maximum(problem.rows.by_cluster(problem.rows.located), 0.0)
+    of_location = np.einsum("cmi,cmi,cm->i", found.columns, found.columns, located)
     u = _products(projection.adjoint(drawn.raw), found)
     values = problem.observed_values
     for effect, group in zip(found.effects, found.groups, strict=True):

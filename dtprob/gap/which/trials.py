@@ -179,19 +179,19 @@ def _chosen(
         and name != banned
         and _affordable(seen.problem, name)
     ]
-    by_score = _promising(able, screening.log_bayes_factor)
+    by_score = _by_gain(able, screening.log_bayes_factor)
     if not scans:
         return [screening.names[i] for i in by_score[: settings.candidates]]
     ranked = []
     for found in scans:
         gained = {i: found[screening.names[i]].gain for i in able if screening.names[i] in found}
         ranked.append(sorted((i for i in gained if gained[i] > _WORTH), key=lambda i: -gained[i]))
-    locating = _promising([i for i in able if screening.locates[i]], screening.log_bayes_factor)
+    locating = _by_gain([i for i in able if screening.locates[i]], screening.log_bayes_factor)
     chosen = _in_turn(by_score, locating, _in_turn(*ranked))
     return [screening.names[i] for i in chosen[: settings.candidates]]
 
 
-def _promising(able: Sequence[int], gain: np.ndarray) -> list[int]:
+def _by_gain(able: Sequence[int], gain: np.ndarray) -> list[int]:
     """Candidates by falling gain, down to a share of the best one's."""
     least = _HOPELESS * max((gain[i] for i in able), default=0.0)
     return sorted((i for i in able if gain[i] > max(least, 0.0)), key=lambda i: -gain[i])

@@ -120,6 +120,12 @@ def test_a_place_without_an_angle_is_looked_for_too():
     np.testing.assert_allclose(places(problem, settled(problem, stuck).x), LATE, atol=0.1)
 
 
+def pulses_at(late, amplitude):
+    """Pulses (link, tap) of these amplitudes, each link as late as it is (link, 1)."""
+    apart = (TAPS - late)[..., None] - PULSES
+    return jnp.exp(-0.5 * (apart / 0.2) ** 2) @ amplitude
+
+
 @model(cluster="link", axes={"amplitude": ("pulse",), "power": ("link", "tap")})
 def two_places(links, y=None):
     """Each link has two pulses of a strength of its own; those of another place could stand there instead."""
@@ -127,8 +133,7 @@ def two_places(links, y=None):
     with numpyro.plate("link", links, dim=-2):
         late = numpyro.sample("late", dist.Normal(0.0, 1.0))
         loud = numpyro.sample("loud", dist.Normal(0.0, 1.0))
-        apart = (TAPS - late)[..., None] - PULSES
-        pulses = jnp.exp(-0.5 * (apart / 0.2) ** 2) @ amplitude
+        pulses = pulses_at(late, amplitude)
         power = numpyro.deterministic("power", jnp.exp(loud) * pulses)
         with numpyro.plate("tap", len(TAPS), dim=-1):
             numpyro.sample("y", dist.Normal(power, NOISE), obs=y)
@@ -187,8 +192,7 @@ def silenced(links, y=None):
     noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
     with numpyro.plate("link", links, dim=-2):
         late = numpyro.sample("late", dist.Normal(0.0, 1.0))
-        apart = (TAPS - late)[..., None] - PULSES
-        pulses = jnp.exp(-0.5 * (apart / 0.2) ** 2) @ amplitude
+        pulses = pulses_at(late, amplitude)
         power = numpyro.deterministic("power", jnp.exp(all_loud) * pulses)
         with numpyro.plate("tap", len(TAPS), dim=-1):
             numpyro.sample("y", dist.Normal(power, noise), obs=y)
