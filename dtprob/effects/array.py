@@ -31,9 +31,17 @@ from dtprob.effects.common import (
 )
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.elements import DIRECTION, Advance, arrays, ends, phase_rewrite
+from dtprob.effects.unfolding import to_transmitter
+from dtprob.raytracing.field import frequency_response
+from dtprob.raytracing.paths import PathSet
 
 _NEIGHBOUR: Final = 1.5
 """Elements count as neighbours up to this multiple of the smallest distance, so those across a square do."""
+_OF_A_PATH: Final = (
+    *("noiseless_channel", "path_gain", "path_delay", "path_phase"),
+    *("rx_response", "tx_response", "frequency_response"),
+)
+"""Sites from which the sum over paths is made anew."""
 
 
 def array_calibration(sites: Sites, _data: Data) -> list[Effect]:
@@ -168,24 +176,50 @@ def element_spacing(sites: Sites, data: Data) -> list[Effect]:
 
 
 def near_field(sites: Sites, data: Data) -> list[Effect]:
-    """Wave fronts are spheres, not planes."""
+    """Wave fronts are spheres, not planes, at both ends: elements at one see the other's apart."""
+    found = arrays(sites, data)
+    if not found or not all(offers(sites, name) for name in _OF_A_PATH):
+        return []
 
-    def curvature(p: Mapping[str, Any], k: Any, r: Any, context: Mapping[str, Any]) -> Any:
-        paths, along_wave = context["paths"], jnp.einsum("...x,ax->...a", k, r)
-        length = jnp.where(paths.mask, paths.length, 1.0)[..., None]
-        return p["share"] * (jnp.sum(r**2, -1) - along_wave**2) / (2 * length)
+    def elements(side: str, context: Mapping[str, Any]) -> jax.Array:
+        return jnp.asarray(context[f"{side}_array"]) if side in found else jnp.zeros((1, 3))
+
+    def bend(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        paths = context["paths"]
+        detour = _detour(paths, elements("rx", context), elements("tx", context))
+        turn = phasor(-2 * jnp.pi / paths.wavelength * p["share"] * detour) - 1.0
+        gain = context["path_gain"][:, None] * phasor(context["path_phase"])
+        weight = jnp.einsum(
+            "lsp,lpr,lpt,lprt->lsrtp", gain, context["rx_response"], context["tx_response"], turn
+        )
+        subcarriers = jnp.asarray(context["subcarrier_frequency"])
+        response = frequency_response(paths, subcarriers, context["path_delay"])
+        return value + jnp.einsum("lsrtp,lpk->lsrtk", weight, response * context["frequency_response"])
 
     return [
-        _phase_effect(
+        Effect(
             "near_field",
-            side,
-            normal("share", 1.0),
-            curvature if side == "rx" else lambda p, k, r, context: -curvature(p, k, r, context),
-            physics=f"Quadratic phase over the {side} array; share 1 is the sphere of the unfolded length.",
-            source="Fresnel: |L k + r| = L + r.k + (|r|^2 - (r.k)^2) / (2 L).",
+            {"noiseless_channel": bend},
+            (normal("share", 1.0),),
+            physics="Every pair of elements at its own distance; share 1 is the exact one.",
+            source="|L k + r - t| - L - k.(r - t), r as the transmitter sees it in the mirrors; image method.",
+            requires=("paths", "subcarrier_frequency", *(f"{side}_array" for side in found)),
         )
-        for side in arrays(sites, data)
     ]
+
+
+def _detour(
+    paths: PathSet, rx: Float[Array, "rx_antenna 3"], tx: Float[Array, "tx_antenna 3"]
+) -> Float[Array, "link path rx_antenna tx_antenna"]:
+    """Distance between elements along each path, less that of a plane wave, m; formed without cancellation."""
+    shape = paths.departure.shape
+    mirrored = jax.vmap(lambda r: to_transmitter(paths, jnp.broadcast_to(r, shape)), out_axes=2)(rx)
+    step = mirrored[:, :, :, None] - tx
+    along = jnp.einsum("lpx,lprtx->lprt", paths.departure, step)
+    length = jnp.where(paths.mask, paths.length, 1.0)[..., None, None]
+    square = jnp.sum(step**2, -1)
+    exact = jnp.sqrt(length**2 + 2 * length * along + square)
+    return (square - along**2) / (exact + length + along)
 
 
 def angular_spread(sites: Sites, data: Data) -> list[Effect]:

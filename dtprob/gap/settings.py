@@ -13,7 +13,7 @@ class Settings:
         level: false-alarm probability of a whole diagnosis, shared by the effects and the site tests.
         replicates: bootstrap replicates of the score statistics.
         site_replicates: bootstrap replicates of the site tests; each costs about one gradient.
-        site_times: where a site test comes near its level, this many times more replicates decide.
+        site_times: where a site test comes near its level, up to this many times more replicates decide.
         candidates: how many effects are refitted in full at each step of the search.
         polished: how many of these, and of the fits of the base model, are also freed from local optima of the nuisances.
         max_effects: the largest set of effects that is looked for.

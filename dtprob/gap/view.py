@@ -36,8 +36,7 @@ class View:
 
     def alarmed(self, settings: Settings) -> bool:
         """Whether the effects' scores or the site tests show a gap at the level."""
-        level = settings.level / 2
-        return float(self.screening.adjusted.min(initial=1.0)) <= level or self.location.site_p_value <= level
+        return self.screening.shows_gap(settings) or self.location.site_p_value <= settings.level / 2
 
 
 def view(
@@ -48,5 +47,8 @@ def view(
     drawn = replicate(problem, fitted, projection, key, settings)
     problem, placed = place(problem, fitted, drawn)
     screening = screen(problem, fitted, projection, drawn, settings, placed=placed)
-    location = locate(problem, fitted, projection, drawn, settings) if located else NOWHERE
+    location = NOWHERE
+    if located:
+        decisive = bool(fitted.effects) or not screening.shows_gap(settings)
+        location = locate(problem, fitted, projection, drawn, settings, decisive=decisive)
     return View(problem, fitted, projection, screening, location)

@@ -25,6 +25,7 @@ _SHORT = 4
 _LONG = 3
 _ENOUGH = 3
 _SAME = 0.1
+_OTHER = 1.0  # nats by which a mode is higher that is another one, not the same more closely
 _COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
 
 
@@ -38,7 +39,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         problem: the model on its data.
         key: for prior draws.
         starts: the centre of the prior and at most this many less one draws from it; fewer where the best agree.
-        polished: how many of the fits, the best of each optimum, are freed from local optima.
+        polished: how many of the fits, the best of each optimum, are freed from local optima, if no two end in one mode.
 
     Raises:
         InputError: the model has no finite likelihood from any start; what breaks is named.
@@ -61,6 +62,8 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     freed: list[fitting.Fit] = []
     for fitted in found[:polished]:
         freed.append(polish(problem, fitted, freed=freed))
+        if any(_is_same(freed[-1], other) for other in freed[:-1]):
+            break  # two starts that end in one mode
     best = settled(problem, max([*freed, *found[polished:]], key=lambda f: f.log_posterior))
     return polish(problem, best, added) if added and not polished else best
 
@@ -98,9 +101,12 @@ def polish(
         short.sort(key=lambda f: -f.log_posterior)
         long = [fitting.fit(problem, f.x, fitted.effects, spread=fitted.spread) for f in short[:_LONG]]
         best = max(long, key=lambda f: f.log_posterior, default=fitted)
-        if best.log_posterior < fitted.log_posterior + 0.1:
+        gained = best.log_posterior - fitted.log_posterior
+        if gained < _SAME:
             return fitted
         fitted = best
+        if gained < _OTHER:
+            return fitted
     return fitted
 
 

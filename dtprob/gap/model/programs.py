@@ -24,39 +24,49 @@ _PLACES: Final = 96
 class Programs:
     """The compiled derivatives of all candidates, shared by every fit of one diagnosis.
 
-    Sites come in the largest shape that any candidate gives them, so one compilation serves all fits.
+    Sites come in the largest shape that any candidate gives them, so one compilation serves all fits. Mean effects have a
+    program for each family: it is kept between commands, and so serves other sets of candidates.
     """
 
     def __init__(self, effects: Sequence[Effect], data: Data) -> None:
-        self._arrays, static = split_static(data)
+        self._arrays, self._static = split_static(data)
         means = [e for e in effects if e.kind == "mean" and e.rewrites]
         fields = [e for e in effects if e.kind == "variance"]
-
-        def tangents(
-            values: Mapping[str, jax.Array], nulls: Mapping[str, jax.Array], arrays: Any
-        ) -> dict[str, dict[str, jax.Array]]:
-            context = Context(eqx.combine(arrays, static), values)
-            return {
-                e.name: {s: _derivative(e, s, values[s], nulls[e.name], context) for s in e.rewrites}
-                for e in means
-            }
+        families = {e.family: [other for other in means if other.family == e.family] for e in means}
 
         def energy(
             values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], arrays: Any
         ) -> dict[str, jax.Array]:
-            context = Context(eqx.combine(arrays, static), values)
+            context = Context(eqx.combine(arrays, self._static), values)
             return {e.name: _field_energy(e, values, gradients, context) for e in fields}
 
+        self._energy = Hoisted(energy)
+        self._tangents = {family: self._tangents_of(own) for family, own in families.items()}
+        self._trials = {family: self._trials_of(own) for family, own in families.items()}
+        self._place_scores: dict[str, Hoisted] = {}
+        self._means = {e.name: e for e in means}
+        self._nulls = {e.name: np.asarray(null_vector(e)) for e in means}
+
+    def _tangents_of(self, effects: Sequence[Effect]) -> Hoisted:
+        def tangents(
+            values: Mapping[str, jax.Array], nulls: Mapping[str, jax.Array], arrays: Any
+        ) -> dict[str, dict[str, jax.Array]]:
+            context = Context(eqx.combine(arrays, self._static), values)
+            return {
+                e.name: {s: _derivative(e, s, values[s], nulls[e.name], context) for s in e.rewrites}
+                for e in effects
+            }
+
+        return Hoisted(tangents)
+
+    def _trials_of(self, effects: Sequence[Effect]) -> Hoisted:
         def trials(
             values: Mapping[str, jax.Array], sizes: Mapping[str, jax.Array], arrays: Any
         ) -> dict[str, dict[str, jax.Array]]:
-            context = Context(eqx.combine(arrays, static), values)
-            return {e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in means}
+            context = Context(eqx.combine(arrays, self._static), values)
+            return {e.name: _trial_shifts(e, values, context, sizes[e.name]) for e in effects}
 
-        self._tangents, self._energy, self._trials = Hoisted(tangents), Hoisted(energy), Hoisted(trials)
-        self._means, self._static = {e.name: e for e in means}, static
-        self._place_scores: dict[str, Hoisted] = {}
-        self._nulls = {e.name: np.asarray(null_vector(e)) for e in means}
+        return Hoisted(trials)
 
     def site_tangents(
         self, values: Mapping[str, jax.Array], effects: Sequence[Effect]
@@ -68,7 +78,14 @@ class Programs:
             effects: the candidates; those that have been given another null than at first are taken there.
         """
         own = {e.name: null_vector(e) for e in effects if e.name in self._nulls}
-        return self._tangents(dict(values), {**self._nulls, **own}, self._arrays)
+        found: dict[str, dict[str, jax.Array]] = {}
+        for family, run in self._tangents.items():
+            found |= run(dict(values), self._of({**self._nulls, **own}, family), self._arrays)
+        return found
+
+    def _of(self, by_name: Mapping[str, Any], family: str) -> dict[str, Any]:
+        """What belongs to the effects of a family."""
+        return {name: value for name, value in by_name.items() if self._means[name].family == family}
 
     def place_scores(
         self,
@@ -102,15 +119,15 @@ class Programs:
             name, which of its trials, and for each site the shifts (trial, *site); all effects in portions of one
             size, so that nothing is compiled anew.
         """
-        longest = max((len(v) for v in sizes.values()), default=0)
-        for start in range(0, longest, TRIALS):
-            portion = {n: v[start : start + TRIALS] for n, v in sizes.items() if len(v) > start}
-            shifts = self._trials(
-                dict(values), {n: self._filled(n, portion) for n in self._nulls}, self._arrays
-            )
-            for name, part in portion.items():
-                moved = {site: shift[: len(part)] for site, shift in shifts[name].items()}
-                yield name, slice(start, start + len(part)), moved
+        for family, run in self._trials.items():
+            wanted = self._of(sizes, family)
+            for start in range(0, max((len(v) for v in wanted.values()), default=0), TRIALS):
+                portion = {n: v[start : start + TRIALS] for n, v in wanted.items() if len(v) > start}
+                filled = {n: self._filled(n, portion) for n in self._of(self._nulls, family)}
+                shifts = run(dict(values), filled, self._arrays)
+                for name, part in portion.items():
+                    moved = {site: shift[: len(part)] for site, shift in shifts[name].items()}
+                    yield name, slice(start, start + len(part)), moved
 
     def _filled(self, name: str, portion: Mapping[str, np.ndarray]) -> np.ndarray:
         """One portion of an effect's trials, the null where there are none."""

@@ -29,8 +29,14 @@ from dtprob.gap.where.suspects import Suspect, suspects
 
 _SURE: Final = 0.005
 """Probability below which a site is surely wrong."""
-_CLEAR: Final = (1e-9, 0.1)
+_FIRST_SHARE: Final = 5
+"""Part of the further replicates that are drawn first: most tests are clear after these."""
+_UNTOLD: Final = (1e-9, 0.1)
 """Between these, a first look at the sites does not tell on which side of the level a gap lies."""
+_UNTOLD_PLACE: Final = (1e-6, 0.1)
+"""The same where the effects' scores show the gap, and the sites say only where it lies."""
+_NEAR: Final = (1e-4, 0.05)
+"""Between these, a second look does not tell it either."""
 
 
 @dataclass(frozen=True)
@@ -73,14 +79,31 @@ NOWHERE: Final = Location((), (), {}, 1.0)
 
 
 def locate(
-    problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, settings: Settings
+    problem: Problem,
+    fitted: Fit,
+    projection: Projection,
+    drawn: Replicates,
+    settings: Settings,
+    *,
+    decisive: bool = True,
 ) -> Location:
-    """Test every site family and every block of coordinates at a fit."""
+    """Test every site family and every block of coordinates at a fit.
+
+    Args:
+        problem: the model and candidates on their data.
+        fitted: the fit.
+        projection: of rows there.
+        drawn: the data and replicates there.
+        settings: how many more replicates decide.
+        decisive: whether the site tests decide if there is a gap; otherwise they only say where it lies.
+    """
     blocks, maps = scan_coordinates(problem, drawn)
     ways = _ways(problem, projection.origin)  # what was fitted to these data would agree with them
     seen = _test_sites(problem, fitted, projection, drawn, ways)
-    if _CLEAR[0] < seen.p_value < _CLEAR[1] and (further := more(drawn, settings.site_times)) is not None:
-        seen = _test_sites(problem, fitted, projection, further, ways)
+    first = (settings.site_times // _FIRST_SHARE, _UNTOLD if decisive else _UNTOLD_PLACE)
+    for times, (low, high) in (first, (settings.site_times, _NEAR))[: 2 if decisive else 1]:
+        if low < seen.p_value < high and (further := more(drawn, times)) is not None:
+            seen = _test_sites(problem, fitted, projection, further, ways)
     sure = {f.site for f in seen.findings if f.p_value <= _SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))

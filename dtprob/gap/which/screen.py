@@ -67,6 +67,10 @@ class Screening:
     replicate_p: np.ndarray
     scores: Scores
 
+    def shows_gap(self, settings: Settings) -> bool:
+        """Whether the scores show a gap at their half of the level."""
+        return float(self.adjusted.min(initial=1.0)) <= settings.level / 2
+
 
 def screen(
     problem: Problem,

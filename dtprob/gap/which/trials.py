@@ -150,7 +150,7 @@ def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], setti
     fitted = seen.fitted
     chosen = max(trials, key=lambda name: credit(seen.problem, trials[name], base))
     so_far = fitted.log_evidence - base.log_evidence
-    paid = float(seen.screening.adjusted.min(initial=1.0)) <= settings.level / 2
+    paid = seen.screening.shows_gap(settings)
     needed = max(0.0 if paid else np.log(len(seen.problem.effects)) + _SURE, settings.minor * so_far)
     return chosen if trials[chosen].log_evidence - fitted.log_evidence > needed else None
 

@@ -12,6 +12,7 @@ from scipy.special import eval_legendre
 
 from dtprob.effects import Rewriting, catalogue
 from dtprob.raytracing.field import path_gain
+from dtprob.raytracing.paths import SPECULAR
 from dtprob.raytracing.pattern import field_vector
 
 SPEED = 299_792_458.0
@@ -248,19 +249,35 @@ def test_elements_turn_with_their_array(world, apply, side):
     assert "path_gain" not in catalogue(world.sites, world.data, [effect.name])[0].rewrites
 
 
-def test_near_field_is_the_sphere(world, apply):
-    paths, array = world.data["paths"], 10 * np.asarray(world.data["rx_array"])
-    data = {**world.data, "rx_array": jnp.asarray(array)}
-    found = np.angle(apply("near_field[rx]", data=data, share=1.0)["rx_response"])
-    flat = np.angle(apply(data=data)["rx_response"])
-    vector = (np.asarray(paths.length)[..., None] * np.asarray(paths.arrival))[:, :, None] + array
-    distance = np.linalg.norm(vector, axis=-1) - np.asarray(paths.length)[..., None]
-    sphere = -2 * np.pi / paths.wavelength * distance
+def mirrored(point, paths, link, path):
+    """A point at the receiver, mirrored at the planes on the way back to the transmitter."""
+    for step in reversed(range(paths.depth)):
+        if np.asarray(paths.interaction)[link, path, step] == SPECULAR:
+            normal, vertex = (np.asarray(v)[link, path, step] for v in (paths.normal, paths.vertex))
+            point = point - 2 * ((point - vertex) @ normal) * normal
+    return point
 
-    def error(phase):
-        return np.max(np.abs(np.angle(np.exp(1j * (phase - sphere))))[np.asarray(paths.mask)])
 
-    assert error(found) < 0.15 * error(flat)
+def test_near_field_is_the_distance_between_elements(world, apply):
+    paths = world.data["paths"]
+    rx, tx = (20 * np.asarray(world.data[name]) for name in ("rx_array", "tx_array"))
+    data = {**world.data, "rx_array": jnp.asarray(rx), "tx_array": jnp.asarray(tx)}
+    flat, found = apply(data=data), apply("near_field", data=data, share=1.0)
+    frequency = np.asarray(world.data["subcarrier_frequency"])
+    expected = np.zeros_like(flat["noiseless_channel"])
+    for link, path in np.argwhere(np.asarray(paths.mask)):
+        centre, start = (np.asarray(v)[link] for v in (paths.rx_position, paths.tx_position))
+        images = np.stack([mirrored(centre + r, paths, link, path) for r in rx])
+        distance = np.linalg.norm(images[:, None] - (start + tx), axis=-1)
+        delay = np.asarray(paths.length)[link, path] / SPEED
+        tone = np.exp(-2j * np.pi * (distance[..., None] / paths.wavelength + delay * frequency))
+        expected[link] += flat["path_gain"][link, path] * tone
+
+    def error(channel):
+        return np.abs(channel - expected).max() / np.abs(expected).max()
+
+    assert error(found["noiseless_channel"]) < 1e-6
+    assert error(flat["noiseless_channel"]) > 1e-2
 
 
 def test_a_vertical_cut_is_a_sum_of_zonal_harmonics(world, apply):
