@@ -123,7 +123,7 @@ class DiagnosisSection:
         tolerance_db: residual error that does not matter, in dB below the signal; of powers, their rms error in dB.
     """
 
-    candidates: int = 6
+    candidates: int = 8
     polished: int = 3
     max_effects: int = 3
     tolerance_db: float | None = None

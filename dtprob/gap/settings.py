@@ -15,7 +15,8 @@ class Settings:
         site_replicates: bootstrap replicates of the site tests; each costs about one gradient.
         site_times: where a site test comes near its level, up to this many times more replicates decide.
         candidates: how many effects are refitted in full at each step of the search.
-        polished: how many of these, and of the fits of the base model, are also freed from local optima of the nuisances.
+        polished: how many of these, and of the fits of the base model, are also freed from local optima of the nuisances;
+            beside effects that are fitted at most one.
         max_effects: the largest set of effects that is looked for.
         folds: parts of the clusters for cross-fitted held-out losses.
         grid: trial sizes per effect parameter when a refit looks for its starting points.
@@ -32,7 +33,7 @@ class Settings:
     replicates: int = 400
     site_replicates: int = 99
     site_times: int = 20
-    candidates: int = 6
+    candidates: int = 8
     polished: int = 3
     max_effects: int = 3
     folds: int = 4

@@ -37,6 +37,8 @@ _HOPELESS: Final = 0.05
 """Share of the best candidate's promise below which another one is not refitted."""
 _WORTH: Final = 3.0
 """Nats that an effect has to gain in a scan."""
+_POLISHED_LATER: Final = 1
+"""Refits that are freed from local optima beside effects that are fitted: these were, too."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 _LOOKS: Final = (scan, scan_anew, scan_anew_about_centre)
@@ -105,7 +107,8 @@ def tried(
             if name in found
         ]
         trials[name] = refit(problem, start, effects[name], starts)
-    return Trials(problem, polished(problem, start, trials, settings.polished))
+    count = min(settings.polished, _POLISHED_LATER) if fitted.effects else settings.polished
+    return Trials(problem, polished(problem, start, trials, count))
 
 
 def _together(problem: Problem, names: Sequence[str]) -> Problem:
