@@ -157,30 +157,45 @@ def cross_cluster_traffic(sites: Sites, data: Data) -> list[Effect]:
         return []
     effects: list[Effect] = []
     for i, j in ordered:
-        effects.append(_coupled(clusters, i, j, same=False))
+        effects.append(_passed_on(clusters, i, j))
         if of[i] < of[j]:
-            effects.append(_coupled(clusters, i, j, same=True))
+            effects.append(_coupled(clusters, i, j))
     return effects
 
 
-def _coupled(clusters: ClustersLike, i: int, j: int, *, same: bool) -> Effect:
-    """Device i's arrival, in this slot or the one before, changes the odds of device j's."""
-    # A packet of the slot before may be passed on, which only adds; in the same slot neither comes first.
-    cause, at_rest = (same_arrival, 0.5) if same else (last_arrival, 0.0)
+def _passed_on(clusters: ClustersLike, i: int, j: int) -> Effect:
+    """A packet that came to device i in the slot before comes to device j, too."""
+
+    def forward(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        last = last_arrival(context, clusters, i)[..., None, None]
+        return mixed_at(value, clusters, j, joined, p["passed"] * last)
+
+    return Effect(
+        "cross_cluster_traffic",
+        {"arrival_logits": forward},
+        (half_normal("passed", 1.0),),
+        instance=f"{i}_to_{j}",
+        physics=f"A packet of device {i} in the slot before is passed on to device {j} with probability 1 - exp(-passed).",
+        source="Superposition: P(a) of outcomes without the device moves to those with it.",
+        requires=("clusters", "previous"),
+    )
+
+
+def _coupled(clusters: ClustersLike, i: int, j: int) -> Effect:
+    """Device i's arrival changes the odds of device j's in the same slot; neither comes first."""
 
     def couple(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        last = cause(context, clusters, i) - at_rest
-        return of_device(value, clusters, j, p["log_odds"] * last[..., None])
+        beside = same_arrival(context, clusters, i) - 0.5
+        return of_device(value, clusters, j, p["log_odds"] * beside[..., None])
 
-    when, law = ("the same slot", "(a_i[t] - 1/2)") if same else ("the slot before", "a_i[t-1]")
     return Effect(
         "cross_cluster_traffic",
         {"arrival_logits": couple},
         (normal("log_odds", 1.0),),
-        instance=f"{i}_with_{j}" if same else f"{i}_to_{j}",
-        physics=f"An arrival at device {i} in {when} changes the odds of one at device {j}.",
-        source=f"Log-linear interaction: P(a_j | the others) tilted by c {law}.",
-        requires=("clusters", "arrivals" if same else "previous"),
+        instance=f"{i}_with_{j}",
+        physics=f"An arrival at device {i} in the same slot changes the odds of one at device {j}.",
+        source="Log-linear interaction: P(a_j | the others) tilted by c (a_i[t] - 1/2).",
+        requires=("clusters", "arrivals"),
     )
 
 

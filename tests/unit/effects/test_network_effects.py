@@ -10,7 +10,7 @@ import pytest
 
 from dtprob.effects import catalogue
 from dtprob.effects.network import FAMILIES
-from dtprob.effects.network.laws import tilted
+from dtprob.effects.network.laws import last_arrival, tilted
 from dtprob.effects.rewriting import Rewriting
 from dtprob.models.declaration import declare, trace_model
 from dtprob.models.multi_access import multi_access, records
@@ -123,19 +123,29 @@ def test_the_disconnection_of_the_report(offered, data):
 
 
 def test_one_device_s_odds_change_and_its_neighbours_go_on_as_before(offered, data):
-    effect = offered["cross_cluster_traffic[3_to_0]"]
-    before, after = law(data, None), law(data, effect, log_odds=jnp.array(0.7))
-    grown = after.reshape(-1, *after.shape[-2:])
-    assert np.ptp(grown[:, 0, 1]) > 0.01
-    first = before[0, 0, 0]
-    with_, without = grown[:, 0, 2:], grown[:, 0, :2]
+    effect = offered["cross_cluster_traffic[0_with_3]"]
+    before, after = law(data, None), law(data, effect, log_odds=jnp.array(1.4))
+    grown = after.reshape(-1, *after.shape[-2:])[:, 1]
+    first = before[0, 0, 1]
+    with_, without = (grown[:, [has, has + 2]] for has in (1, 0))
     np.testing.assert_allclose(
-        with_ + without, np.broadcast_to(first[2:] + first[:2], with_.shape), rtol=1e-6
+        with_ + without, np.broadcast_to(first[[1, 3]] + first[[0, 2]], with_.shape), rtol=1e-6
     )
-    factor = (with_ / without) / (first[2:] / first[:2])
+    factor = (with_ / without) / (first[[1, 3]] / first[[0, 2]])
     np.testing.assert_allclose(factor[:, 0], factor[:, 1], rtol=1e-5)
-    assert factor.min() < 1.001
-    assert factor.max() <= np.exp(0.7) * 1.001
+    np.testing.assert_allclose(np.unique(np.round(factor, 4)), np.round(np.exp([-0.7, 0.7]), 4), rtol=1e-3)
+    others = after.reshape(-1, *after.shape[-2:])[:, 0]
+    np.testing.assert_allclose(others, np.broadcast_to(before[0, 0, 0], others.shape), rtol=1e-6)
+
+
+def test_a_packet_is_passed_on_to_the_other_cluster(offered, data):
+    effect = offered["cross_cluster_traffic[3_to_0]"]
+    before, after = law(data, None), law(data, effect, passed=jnp.log(4.0))
+    grown = after.reshape(-1, *after.shape[-2:])
+    first, last = before[0, 0, 0], np.asarray(last_arrival(data, data["clusters"], 3)).reshape(-1)
+    assert set(np.unique(last)) == {0.0, 1.0}
+    with_ = first[2:] + np.where(last[:, None] > 0, 0.75, 0.0) * first[:2]
+    np.testing.assert_allclose(grown[:, 0, 2:], with_, atol=1e-9)
     np.testing.assert_allclose(grown[:, 1], np.broadcast_to(before[0, 0, 1], grown[:, 1].shape), rtol=1e-6)
 
 
