@@ -61,7 +61,7 @@ def test_no_cause_is_unlisted_where_a_site_is_wrong():
 
 def seen(problem, fitted, adjusted):
     """What `best` looks at: a fit, and the smallest family-wise p-value of the scores there."""
-    screening = SimpleNamespace(adjusted=np.array([0.9, adjusted]))
+    screening = SimpleNamespace(shows_gap=lambda settings: adjusted <= settings.level / 2)
     return SimpleNamespace(problem=problem, fitted=fitted, screening=screening)
 
 
