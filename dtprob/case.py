@@ -118,7 +118,8 @@ class DiagnosisSection:
 
     Attributes:
         candidates: how many effects are refitted in full at each step.
-        polished: how many fits are freed from local optima of the unknown parameters at each step; 0 for none.
+        polished: how many fits are freed from local optima of the unknown parameters at each step, beside
+            fitted effects at most one; 0 for none.
         max_effects: the largest set of effects that is looked for.
         tolerance_db: residual error that does not matter, in dB below the signal; of powers, their rms error in dB.
     """

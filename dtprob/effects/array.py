@@ -21,6 +21,7 @@ from dtprob.effects.common import (
     Sites,
     array_of,
     band,
+    chain,
     complex_of,
     each_antenna,
     half_normal,
@@ -32,14 +33,14 @@ from dtprob.effects.common import (
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.elements import DIRECTION, Advance, arrays, ends, phase_rewrite
 from dtprob.effects.unfolding import to_transmitter
+from dtprob.raytracing.beyond import with_all
 from dtprob.raytracing.field import frequency_response
 from dtprob.raytracing.paths import PathSet
 
 _NEIGHBOUR: Final = 1.5
 """Elements count as neighbours up to this multiple of the smallest distance, so those across a square do."""
 _OF_A_PATH: Final = (
-    *("noiseless_channel", "path_gain", "path_delay", "path_phase"),
-    *("rx_response", "tx_response", "frequency_response"),
+    *("path_gain", "path_delay", "path_phase", "rx_response", "tx_response", "frequency_response"),
 )
 """Sites from which the sum over paths is made anew."""
 
@@ -194,7 +195,7 @@ def near_field(sites: Sites, data: Data) -> list[Effect]:
         )
         subcarriers = jnp.asarray(context["subcarrier_frequency"])
         response = frequency_response(paths, subcarriers, context["path_delay"])
-        return value + jnp.einsum("lsrtp,lpk->lsrtk", weight, response * context["frequency_response"])
+        return value + jnp.einsum("lsrtp,lpk->lsrtk", weight, response) * chain(context)
 
     return [
         Effect(
@@ -203,7 +204,7 @@ def near_field(sites: Sites, data: Data) -> list[Effect]:
             (normal("share", 1.0),),
             physics="Every pair of elements at its own distance; share 1 is the exact one.",
             source="|L k + r - t| - L - k.(r - t), r as the transmitter sees it in the mirrors; image method.",
-            requires=("paths", "subcarrier_frequency", *(f"{side}_array" for side in found)),
+            requires=("paths", "subcarrier_frequency", *_OF_A_PATH, *(f"{side}_array" for side in found)),
         )
     ]
 
@@ -216,7 +217,7 @@ def _detour(
     mirrored = jax.vmap(lambda r: to_transmitter(paths, jnp.broadcast_to(r, shape)), out_axes=2)(rx)
     step = mirrored[:, :, :, None] - tx
     along = jnp.einsum("lpx,lprtx->lprt", paths.departure, step)
-    length = jnp.where(paths.mask, paths.length, 1.0)[..., None, None]
+    length = jnp.where(with_all(paths).mask, paths.length, 1.0)[..., None, None]
     square = jnp.sum(step**2, -1)
     exact = jnp.sqrt(length**2 + 2 * length * along + square)
     return (square - along**2) / (exact + length + along)
@@ -267,10 +268,10 @@ def _phase_effect(
 
 
 FAMILIES: Final[dict[str, Family]] = {
+    "near_field": near_field,  # what makes the sum over paths anew comes before what acts on the sum
     "array_calibration": array_calibration,
     "cable_delay": cable_delay,
     "mutual_coupling": mutual_coupling,
     "element_spacing": element_spacing,
-    "near_field": near_field,
     "angular_spread": angular_spread,
 }

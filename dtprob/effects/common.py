@@ -111,6 +111,17 @@ def square(value: Complex[Array, "*n"]) -> Float[Array, "*n"]:
     return jnp.real(value) ** 2 + jnp.imag(value) ** 2
 
 
+def chain(context: Mapping[str, Any]) -> Complex[Array, "*link_snapshot_rx_tx_subcarrier"]:
+    """What the devices' chains do to all paths alike, broadcastable to the channel."""
+    factor = jnp.asarray(context["frequency_response"])
+    if "receiver_gain" in context:
+        factor = factor * context["receiver_gain"][:, None, None, None, None]
+    if "receiver_delay" in context:
+        turn = context["receiver_delay"][:, None] * jnp.asarray(context["subcarrier_frequency"])
+        factor = factor * phasor(-2 * jnp.pi * turn)[:, None, None, None, :]
+    return factor
+
+
 def complex_of(pair: Float[Array, "*n 2"]) -> Complex[Array, "*n"]:
     """Real and imaginary part as one complex number."""
     return lax.complex(pair[..., 0], pair[..., 1])

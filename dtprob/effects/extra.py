@@ -21,6 +21,7 @@ from dtprob.effects.common import (
     Family,
     Sites,
     band,
+    chain,
     complex_of,
     half_normal,
     has_phase,
@@ -181,13 +182,7 @@ def _path(
 
 def _shared(context: Mapping[str, Any]) -> Complex[Array, "*link_snapshot_rx_tx_subcarrier"]:
     """What all paths share on their way into the measurement, broadcastable to the channel."""
-    factor = phasor(context["path_phase"][:, :, :1, None, None]) * context["frequency_response"]
-    if "receiver_gain" in context:
-        factor = factor * context["receiver_gain"][:, None, None, None, None]
-    if "receiver_delay" in context:
-        turn = context["receiver_delay"][:, None] * jnp.asarray(context["subcarrier_frequency"])
-        factor = factor * phasor(-2 * jnp.pi * turn)[:, None, None, None, :]
-    return factor
+    return phasor(context["path_phase"][:, :, :1, None, None]) * chain(context)
 
 
 def _response(

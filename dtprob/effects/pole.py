@@ -102,14 +102,12 @@ def _removed(paths: PathSet, width: Any, azimuth: Any, distance: Any) -> Complex
     detour = (distance + after - total) * (distance + after + total) / (way + jnp.hypot(total, height))
     sine, cosine = beside / after, ahead / after
     gradient, curvature = -slope * sine, slope * (1 / distance + cosine**2 / after)
-    bend = (
-        curvature * width**2 / wavelength
-    )  # 1 / (1 + j bend) in polar form: real functions are several times faster
+    # 1 / (1 + j bend) in polar form: real functions are several times faster
+    bend = curvature * width**2 / wavelength
     aside = np.pi * (gradient * width / wavelength) ** 2 / (1 + bend**2)
-    strength = jnp.sqrt(slope * (1 / distance + 1 / after) / wavelength) * jax.lax.rsqrt(
-        jnp.sqrt(1 + bend**2)
-    )
+    strength = jnp.sqrt(slope * (1 / distance + 1 / after) / wavelength)
     strength = strength * total / (distance + after) * (1 + cosine) / 2
+    strength = strength * jax.lax.rsqrt(jnp.sqrt(1 + bend**2))
     size = width * strength * jnp.exp(-aside)
     phase = aside * bend + np.pi / 4 - jnp.arctan(bend) / 2 - 2 * np.pi * detour / wavelength
     field = jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase))

@@ -49,6 +49,6 @@ def view(
     screening = screen(problem, fitted, projection, drawn, settings, placed=placed)
     location = NOWHERE
     if located:
-        decisive = bool(fitted.effects) or not screening.shows_gap(settings)
-        location = locate(problem, fitted, projection, drawn, settings, decisive=decisive)
+        shown = not fitted.effects and screening.shows_gap(settings)
+        location = locate(problem, fitted, projection, drawn, settings, shown=shown)
     return View(problem, fitted, projection, screening, location)

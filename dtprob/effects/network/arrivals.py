@@ -149,7 +149,7 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
 def cross_cluster_traffic(sites: Sites, data: Data) -> list[Effect]:
     """Arrivals of devices in different clusters depend on one another."""
     clusters = _clusters(sites, data)
-    if clusters is None or data.get("arrivals") is None:
+    if clusters is None:
         return []
     of, devices = clusters.cluster_of, range(clusters.devices)
     ordered = [(i, j) for i in devices for j in devices if of[i] != of[j]]
@@ -158,7 +158,7 @@ def cross_cluster_traffic(sites: Sites, data: Data) -> list[Effect]:
     effects: list[Effect] = []
     for i, j in ordered:
         effects.append(_passed_on(clusters, i, j))
-        if of[i] < of[j]:
+        if of[i] < of[j] and data.get("arrivals") is not None:
             effects.append(_coupled(clusters, i, j))
     return effects
 

@@ -25,7 +25,6 @@ _SHORT = 4
 _LONG = 3
 _ENOUGH = 3
 _SAME = 0.1
-_OTHER = 1.0  # nats by which a mode is higher that is another one, not the same more closely
 _COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
 
 
@@ -39,7 +38,8 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         problem: the model on its data.
         key: for prior draws.
         starts: the centre of the prior and at most this many less one draws from it; fewer where the best agree.
-        polished: how many of the fits, the best of each optimum, are freed from local optima, if no two end in one mode.
+        polished: how many of the fits, the best of each optimum, are freed from local optima; fewer where two of
+            them end in one mode.
 
     Raises:
         InputError: the model has no finite likelihood from any start; what breaks is named.
@@ -83,7 +83,7 @@ def polish(
     along: Collection[str] | None = None,
     freed: Sequence[fitting.Fit] = (),
 ) -> fitting.Fit:
-    """Leave local optima: refit from the other peaks along each global nuisance until none is better.
+    """Leave local optima: refit from the other peaks along each global nuisance until none leads elsewhere.
 
     Args:
         problem: the model on its data.
@@ -101,21 +101,23 @@ def polish(
         short.sort(key=lambda f: -f.log_posterior)
         long = [fitting.fit(problem, f.x, fitted.effects, spread=fitted.spread) for f in short[:_LONG]]
         best = max(long, key=lambda f: f.log_posterior, default=fitted)
-        gained = best.log_posterior - fitted.log_posterior
-        if gained < _SAME:
+        if best.log_posterior < fitted.log_posterior + _SAME:
             return fitted
-        fitted = best
-        if gained < _OTHER:
+        before, fitted = fitted, best
+        if _is_near(before, fitted):
             return fitted
     return fitted
 
 
 def _is_same(one: fitting.Fit, other: fitting.Fit) -> bool:
     """Whether two fits have found the same mode."""
+    return abs(one.log_posterior - other.log_posterior) < _SAME and _is_near(one, other)
+
+
+def _is_near(one: fitting.Fit, other: fitting.Fit) -> bool:
+    """Whether two fits are at one place, as far as the data tell places apart."""
     apart = (one.x - other.x)[one.global_index]
-    return abs(one.log_posterior - other.log_posterior) < _SAME and bool(
-        apart @ np.linalg.solve(one.covariance, apart) < _SAME
-    )
+    return bool(apart @ np.linalg.solve(one.covariance, apart) < _SAME)
 
 
 def _other_peaks(

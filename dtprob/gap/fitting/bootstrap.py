@@ -46,6 +46,11 @@ class Replicates:
         """Number of replicates that are taken to the sites."""
         return len(self.rows) - 1
 
+    def most(self, times: int) -> int:
+        """How many times more replicates can be taken to the sites, at most `times`; fewer where the sites are large."""
+        entries = sum(g[0].size for g in self.gradients.values())
+        return int(min(_MOST_VALUES / (max(self.at_sites, 1) * max(entries, 1)), times))
+
     def portions(self) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
         """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
         return _portions(self.problem, self.fitted, self.projection, self.keys)
@@ -77,18 +82,14 @@ def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tupl
     return raw, projection.rows(raw[None])[0]
 
 
-def more(drawn: Replicates, times: int) -> Replicates | None:
-    """As many times more replicates at the sites, all of them new; fewer where the sites are large, None where too large.
+def more(drawn: Replicates, times: int) -> Replicates:
+    """As many times more replicates at the sites, all of them new.
 
     Args:
         drawn: a first look at the same fit.
-        times: how many more.
+        times: how many more; see `Replicates.most`.
     """
     first = drawn.at_sites
-    entries = sum(g[0].size for g in drawn.gradients.values())
-    times = int(min(_MOST_VALUES / (first * max(entries, 1)), times))
-    if times < 2:
-        return None
     keys = jax.random.split(jax.random.fold_in(drawn.keys[0], times), times * first)
     projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
     observed, gradient = drawn.rows[:1], drawn.problem.compiled.site_gradient

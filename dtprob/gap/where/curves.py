@@ -87,11 +87,13 @@ class Quantity:
         name: the site or the column.
         axes: along which it varies.
         values: at their positions.
+        ordered: whether its values are more than names: near ones may act alike.
     """
 
     name: str
     axes: tuple[str, ...]
     values: np.ndarray
+    ordered: bool = True
 
     def kept(self, axes: Sequence[str], shape: Sequence[int]) -> tuple[int, ...] | None:
         """Which of a site's axes are this one's; None where it lies on others."""
@@ -110,7 +112,8 @@ class Quantity:
         distinct, index = np.unique(flat, return_inverse=True)
         if _OFTEN * len(distinct) <= flat.size:
             yield Curves(f"by value of {self.name}", _grouped(index))
-        yield from _over(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
+        if self.ordered:
+            yield from _over(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
 
 
 def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | None:
@@ -122,6 +125,21 @@ def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | N
     if len(np.unique(values)) < _SMOOTH_FROM:
         return None
     return Quantity(name, tuple(axes[i] for i in wide), values)
+
+
+def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quantity]:
+    """What a column of whole numbers on several axes tells apart, as what each device did last.
+
+    Each of its values at each position of the last axis, and what it holds along the last axis all together.
+    """
+    if not (np.issubdtype(values.dtype, np.integer) or values.dtype == bool) or values.ndim < 2:
+        return
+    last = values.shape[-1]
+    each = last * np.unique(values, return_inverse=True)[1].reshape(values.shape) + np.arange(last)
+    yield Quantity(f"{name} of each {axes[-1]}", tuple(axes), each, ordered=False)
+    if last > 1:
+        _, rows = np.unique(values.reshape(-1, last), axis=0, return_inverse=True)
+        yield Quantity(f"{name} of all", tuple(axes[:-1]), rows.reshape(values.shape[:-1]), ordered=False)
 
 
 def curves(problem: Problem, axis: str, size: int) -> tuple[Curves, ...]:

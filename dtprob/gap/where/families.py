@@ -217,6 +217,10 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
     for quantity, all_curves in over:
         if (kept := quantity.kept(site.axes, site.value.shape)) is not None:
             yield from (Pattern(found.label, kept, found) for found in all_curves)
+            rest = tuple(range(len(kept), site.value.ndim))
+            if rest and not quantity.ordered and kept == tuple(range(len(kept))):
+                each = " x ".join(site.axes[i] for i in rest)
+                yield from (Pattern(f"{found.label} x {each}", kept + rest, found) for found in all_curves)
     yield from _cycles(site)
 
 

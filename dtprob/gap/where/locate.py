@@ -21,7 +21,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
-from dtprob.gap.where.curves import Quantity, curves, quantity, whole_columns
+from dtprob.gap.where.curves import Quantity, curves, groups, quantity, whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
@@ -29,14 +29,14 @@ from dtprob.gap.where.suspects import Suspect, suspects
 
 _SURE: Final = 0.005
 """Probability below which a site is surely wrong."""
-_FIRST_SHARE: Final = 5
-"""Part of the further replicates that are drawn first: most tests are clear after these."""
-_UNTOLD: Final = (1e-9, 0.1)
-"""Between these, a first look at the sites does not tell on which side of the level a gap lies."""
-_UNTOLD_PLACE: Final = (1e-6, 0.1)
-"""The same where the effects' scores show the gap, and the sites say only where it lies."""
-_NEAR: Final = (1e-4, 0.05)
-"""Between these, a second look does not tell it either."""
+_MORE: Final = 400
+"""Replicates of a second look at the sites, at least; a third one takes all that the settings allow."""
+_OPEN_AT_FIRST: Final = (1e-9, 0.1)
+"""Between these, a first look does not tell on which side of the level a gap lies."""
+_OPEN_WHERE_SHOWN: Final = (1e-6, 0.1)
+"""The same where the effects' scores show the gap, and the sites say mostly where it lies."""
+_OPEN_AT_SECOND: Final = (0.01, 10.0)
+"""Multiples of the level between which a second look does not tell it either."""
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ def locate(
     drawn: Replicates,
     settings: Settings,
     *,
-    decisive: bool = True,
+    shown: bool = False,
 ) -> Location:
     """Test every site family and every block of coordinates at a fit.
 
@@ -94,16 +94,15 @@ def locate(
         fitted: the fit.
         projection: of rows there.
         drawn: the data and replicates there.
-        settings: how many more replicates decide.
-        decisive: whether the site tests decide if there is a gap; otherwise they only say where it lies.
+        settings: how many more replicates decide at which level.
+        shown: whether the effects' scores show a gap already.
     """
     blocks, maps = scan_coordinates(problem, drawn)
     ways = _ways(problem, projection.origin)  # what was fitted to these data would agree with them
     seen = _test_sites(problem, fitted, projection, drawn, ways)
-    first = (settings.site_times // _FIRST_SHARE, _UNTOLD if decisive else _UNTOLD_PLACE)
-    for times, (low, high) in (first, (settings.site_times, _NEAR))[: 2 if decisive else 1]:
-        if low < seen.p_value < high and (further := more(drawn, times)) is not None:
-            seen = _test_sites(problem, fitted, projection, further, ways)
+    for times, (low, high) in _further_looks(drawn, settings, shown=shown):
+        if low < seen.p_value < high:
+            seen = _test_sites(problem, fitted, projection, more(drawn, times), ways)
     sure = {f.site for f in seen.findings if f.p_value <= _SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
@@ -111,6 +110,19 @@ def locate(
     ordered = tuple(sorted(_spreads_last(seen.findings), key=lambda f: (f.last, f.p_value, -f.gain)))
     strays = differences(problem, drawn)
     return Location(ordered, blocks, maps, seen.p_value, suspected, entries, strays)
+
+
+def _further_looks(
+    drawn: Replicates, settings: Settings, *, shown: bool
+) -> Iterator[tuple[int, tuple[float, float]]]:
+    """How many times more replicates another look takes, and between which p-values of the look before it is taken."""
+    most = drawn.most(settings.site_times)
+    second = min(-(-_MORE // max(drawn.at_sites, 1)), most)
+    if second > 1:
+        yield second, _OPEN_WHERE_SHOWN if shown else _OPEN_AT_FIRST
+    if most > second:
+        low, high = _OPEN_AT_SECOND
+        yield most, (low * settings.level / 2, high * settings.level / 2)
 
 
 class _Tested(NamedTuple):
@@ -169,6 +181,8 @@ def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[
     for name, (axes, value) in (columns | computed).items():
         if (found := quantity(name, axes, value)) is not None:
             yield found
+    for name, (axes, value) in columns.items():
+        yield from groups(name, axes, value)
 
 
 def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:

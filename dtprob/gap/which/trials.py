@@ -38,7 +38,7 @@ _HOPELESS: Final = 0.05
 _WORTH: Final = 3.0
 """Nats that an effect has to gain in a scan."""
 _POLISHED_LATER: Final = 1
-"""Refits that are freed from local optima beside effects that are fitted: these were, too."""
+"""New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
 _LOOKS: Final = (scan, scan_anew, scan_anew_about_centre)
@@ -108,7 +108,8 @@ def tried(
         ]
         trials[name] = refit(problem, start, effects[name], starts)
     count = min(settings.polished, _POLISHED_LATER) if fitted.effects else settings.polished
-    return Trials(problem, polished(problem, start, trials, count))
+    new = {name: one for name, one in trials.items() if name not in known}
+    return Trials(problem, {**trials, **polished(problem, start, new, count)})
 
 
 def _together(problem: Problem, names: Sequence[str]) -> Problem:

@@ -25,9 +25,10 @@ SITES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         "dispersive_walls": (*_MATERIALS, "path_gain", "frequency_response"),
         "antenna_orientation": ("path_gain", *_RESPONSES),
         **dict.fromkeys(
-            ("element_spacing", "near_field", "array_calibration", "mutual_coupling", "beam_squint"),
+            ("element_spacing", "array_calibration", "mutual_coupling", "beam_squint"),
             _RESPONSES,
         ),
+        "near_field": (*_RESPONSES, "noiseless_channel"),
         **dict.fromkeys(
             (
                 "polarization_mismatch",
@@ -127,7 +128,11 @@ PARAMETERS: Final[Mapping[str, Mapping[str, Sizes]]] = {
         "carrier_phase": _as_is,
         "gain_offset": lambda decibels: (decibels * np.log(10) / 20,),
     },
-    "network": {"arrival_rate_shift": lambda share: (-float(np.log1p(-share)),)},
+    "network": {
+        **dict.fromkeys(
+            ("arrival_rate_shift", "cross_cluster_traffic"), lambda share: (-float(np.log1p(-share)),)
+        )
+    },
     "labels": {"scale_bias": lambda slope: (float(np.log1p(slope)), float(np.log1p(-slope)))},
     "custom": {"handover": _either},
 }

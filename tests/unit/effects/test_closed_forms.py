@@ -11,6 +11,8 @@ from scipy.spatial.transform import Rotation
 from scipy.special import eval_legendre
 
 from dtprob.effects import Rewriting, catalogue
+from dtprob.effects.array import _detour
+from dtprob.effects.effect import Context
 from dtprob.raytracing.field import path_gain
 from dtprob.raytracing.paths import SPECULAR
 from dtprob.raytracing.pattern import field_vector
@@ -278,6 +280,35 @@ def test_near_field_is_the_distance_between_elements(world, apply):
 
     assert error(found["noiseless_channel"]) < 1e-6
     assert error(flat["noiseless_channel"]) > 1e-2
+
+
+@pytest.mark.parametrize("missing", ["rx_array", "tx_array"])
+def test_near_field_of_one_array_turns_its_elements_alone(build_world, apply, missing):
+    own = "tx" if missing == "rx_array" else "rx"
+    world = build_world(**{missing: None})
+    (effect,) = catalogue(world.sites, world.data, ["near_field"])
+    assert set(effect.requires) >= {f"{own}_array", "path_phase"}
+    assert missing not in effect.requires
+    values = {n: jnp.asarray(v) for n, v in apply(data=world.data).items()}
+    context = Context(world.data, values)
+    bent = effect.rewrites["noiseless_channel"](values["noiseless_channel"], {"share": 1.0}, context)
+    assert bent.shape == values["noiseless_channel"].shape
+    size = float(np.abs(bent - values["noiseless_channel"]).max() / np.abs(bent).max())
+    assert 1e-6 < size < 0.1
+
+
+def test_near_field_comes_before_what_acts_on_the_sum_of_the_paths(world):
+    names = [e.name for e in catalogue(world.sites, world.data, "all")]
+    assert names.index("near_field") < min(i for i, n in enumerate(names) if n.startswith("cable_delay"))
+
+
+def test_near_field_of_paths_of_other_traces_has_their_own_length(world):
+    paths = world.data["paths"]
+    arrays = (jnp.asarray(world.data[name]) for name in ("rx_array", "tx_array"))
+    detour = np.asarray(_detour(paths, *arrays))
+    other = np.asarray(paths.beyond) > 0
+    assert other.any()
+    assert np.abs(detour[other]).max() < 2 * np.abs(detour[np.asarray(paths.mask)]).max()
 
 
 def test_a_vertical_cut_is_a_sum_of_zonal_harmonics(world, apply):
