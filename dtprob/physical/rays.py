@@ -117,7 +117,10 @@ def join(
 
 def turning(start: Float[np.ndarray, "*n 3"], end: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3 3"]:
     """The mirror that maps one unit vector to another: the Householder reflection in their difference."""
-    difference = start - end
+    difference, middle = start - end, start + end
+    along, square = (np.sum(middle * v, axis=-1, keepdims=True) for v in (difference, middle))
+    # Unit vectors differ across their middle; rounding of their lengths would tilt the mirror between near ones.
+    difference = difference - np.where(square > 1, middle * along / np.maximum(square, 1), 0.0)
     norm = np.sum(difference**2, axis=-1)[..., None, None]
     outer = difference[..., :, None] * difference[..., None, :]
     return np.eye(3) - 2 * np.where(norm > 0, outer / np.where(norm > 0, norm, 1.0), 0.0)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dtprob.errors import InputError
@@ -44,6 +44,8 @@ def test_a_missing_mirror_does_nothing():
 
 @settings(deadline=None)
 @given(UNIT, UNIT)
+@example([0.0, 0.0, 1.0], [0.0, 1.192092896e-07, 0.75])  # nearly one direction
+@example([0.0, 0.6, 0.8], [0.0, -0.6, -0.8])
 def test_turning_maps_one_direction_to_the_other(start, end):
     start, end = unit(start), unit(end)
     found = turning(start[None], end[None])[0]
