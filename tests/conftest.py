@@ -1,10 +1,11 @@
-"""Settings of the whole test suite: double precision, a sound compiler, and no silent skips on CI."""
+"""Settings of the whole test suite: double precision, a sound compiler, fixed examples, and no silent skips on CI."""
 
 import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
 
+import hypothesis
 import pytest
 
 from dtprob.threads import one_thread
@@ -17,6 +18,9 @@ import jax  # noqa: E402
 
 jax.config.update("jax_enable_x64", True)
 
+
+hypothesis.settings.register_profile("fixed", derandomize=True)
+hypothesis.settings.load_profile("fixed")
 
 _LEFT_OUT = "jax_disable_most_optimizations"
 _MAPS = Path("/proc/self/maps")
