@@ -29,9 +29,10 @@ from dtprob.effects.common import (
     offers,
     on_axis,
     phasor,
+    positions,
 )
-from dtprob.effects.effect import FIELD, Effect, Parameter
-from dtprob.effects.elements import DIRECTION, Advance, arrays, ends, phase_rewrite
+from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.elements import DIRECTION, arrays, ends, phase_rewrite
 from dtprob.effects.unfolding import to_transmitter
 from dtprob.raytracing.beyond import with_all
 from dtprob.raytracing.field import frequency_response
@@ -40,7 +41,12 @@ from dtprob.raytracing.paths import PathSet
 _NEIGHBOUR: Final = 1.5
 """Elements count as neighbours up to this multiple of the smallest distance, so those across a square do."""
 _OF_A_PATH: Final = (
-    *("path_gain", "path_delay", "path_phase", "rx_response", "tx_response", "frequency_response"),
+    "path_gain",
+    "path_delay",
+    "path_phase",
+    "rx_response",
+    "tx_response",
+    "frequency_response",
 )
 """Sites from which the sum over paths is made anew."""
 
@@ -163,14 +169,19 @@ def _neighbours(array: Float[np.ndarray, "antenna 3"]) -> Float[np.ndarray, "kin
 
 def element_spacing(sites: Sites, data: Data) -> list[Effect]:
     """The aperture is larger or smaller than recorded."""
+
+    def stretch(p: Mapping[str, Any], k: Any, r: Any) -> Any:
+        return p["scale"] * jnp.einsum("...x,ax->...a", k, r)
+
     return [
-        _phase_effect(
+        Effect(
             "element_spacing",
-            side,
-            normal("scale", 0.02),
-            lambda p, k, r, _: p["scale"] * jnp.einsum("...x,ax->...a", k, r),
+            {f"{side}_response": phase_rewrite(side, stretch)},
+            (normal("scale", 0.02),),
+            instance=side,
             physics=f"All distances between {side} elements are off by one relative amount.",
             source="exp(-+j 2 pi / lambda (1 + s) r.k).",
+            requires=("paths", f"{side}_array", DIRECTION[side]),
         )
         for side in arrays(sites, data)
     ]
@@ -182,12 +193,9 @@ def near_field(sites: Sites, data: Data) -> list[Effect]:
     if not found or not all(offers(sites, name) for name in _OF_A_PATH):
         return []
 
-    def elements(side: str, context: Mapping[str, Any]) -> jax.Array:
-        return jnp.asarray(context[f"{side}_array"]) if side in found else jnp.zeros((1, 3))
-
     def bend(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
         paths = context["paths"]
-        detour = _detour(paths, elements("rx", context), elements("tx", context))
+        detour = _detour(paths, positions(context, "rx"), positions(context, "tx"))
         turn = phasor(-2 * jnp.pi / paths.wavelength * p["share"] * detour) - 1.0
         gain = context["path_gain"][:, None] * phasor(context["path_phase"])
         weight = jnp.einsum(
@@ -250,21 +258,6 @@ def angular_spread(sites: Sites, data: Data) -> list[Effect]:
 
 def _gain(log_gain: Float[Array, "*n"], phase: Float[Array, "*n"]) -> jax.Array:
     return jnp.exp(log_gain) * phasor(phase)
-
-
-def _phase_effect(
-    family: str, side: str, parameter: Parameter, advance: Advance, *, physics: str, source: str
-) -> Effect:
-    """An effect that adds advance(p, k, r, context), in m along the wave, to the phase of every element."""
-    return Effect(
-        family,
-        {f"{side}_response": phase_rewrite(side, advance)},
-        (parameter,),
-        instance=side,
-        physics=physics,
-        source=source,
-        requires=("paths", f"{side}_array", DIRECTION[side]),
-    )
 
 
 FAMILIES: Final[dict[str, Family]] = {

@@ -217,6 +217,12 @@ def array_of(data: Data, side: str) -> np.ndarray | None:
     return np.asarray(array, dtype=float) if array is not None and np.shape(array)[0] > 1 else None
 
 
+def positions(context: Data, side: str) -> Float[Array, "antenna 3"]:
+    """Element positions in m at one end, its centre where no array is known."""
+    array = context.get(f"{side}_array")
+    return jnp.zeros((1, 3)) if array is None else jnp.asarray(array)
+
+
 def touched_objects(data: Data) -> list[tuple[int, str]]:
     """Index and name of every object that an existing path meets, in the order of the scene."""
     paths: PathSet | None = data.get("paths")

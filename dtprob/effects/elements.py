@@ -19,8 +19,8 @@ DIRECTION: Final = {"rx": "arrival", "tx": "departure"}
 
 _SIGN: Final = {"rx": -1.0, "tx": 1.0}
 
-type Advance = Callable[[Mapping[str, Any], Any, Any, Mapping[str, Any]], Any]
-"""(parameters, direction, element positions, context) -> metres along the wave, for every element of every path."""
+type Advance = Callable[[Mapping[str, Any], Any, Any], Any]
+"""(parameters, direction, element positions) -> metres along the wave, for every element of every path."""
 
 
 def ends(sites: Sites) -> list[tuple[str, int]]:
@@ -43,7 +43,7 @@ def phase_rewrite(side: str, advance: Advance) -> Rewrite:
 
     def turn(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
         paths, positions = context["paths"], jnp.asarray(context[f"{side}_array"])
-        metres = advance(p, context[DIRECTION[side]], positions, context)
+        metres = advance(p, context[DIRECTION[side]], positions)
         return value * phasor(_SIGN[side] * 2 * jnp.pi / paths.wavelength * metres)
 
     return turn

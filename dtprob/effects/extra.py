@@ -30,6 +30,7 @@ from dtprob.effects.common import (
     normal,
     offers,
     phasor,
+    positions,
     touched_objects,
 )
 from dtprob.effects.effect import FIELD, Effect
@@ -155,9 +156,9 @@ def _towards(context: Mapping[str, Any], near: str | None) -> jax.Array:
     paths = context["paths"]
     direction, _ = _leg(paths.tx_position, paths.rx_position)
     if near == "receiver":
-        return _response(context, "tx_array", direction, 1.0)[:, None, None, :, None]
+        return _response(context, "tx", direction, 1.0)[:, None, None, :, None]
     if near == "transmitter":
-        return _response(context, "rx_array", direction, -1.0)[:, None, :, None, None]
+        return _response(context, "rx", direction, -1.0)[:, None, :, None, None]
     return jnp.ones((1, 1, 1, 1, 1))
 
 
@@ -175,8 +176,8 @@ def _path(
     paths = context["paths"]
     tones = 1.0 / paths.wavelength + jnp.asarray(context["subcarrier_frequency"]) / speed_of_light
     tone = phasor(-2 * jnp.pi * length[:, None] * tones)
-    rx = _response(context, "rx_array", arrival, -1.0)
-    tx = _response(context, "tx_array", departure, 1.0)
+    rx = _response(context, "rx", arrival, -1.0)
+    tx = _response(context, "tx", departure, 1.0)
     return jnp.einsum("lr,lt,lk->lrtk", rx, tx, tone)[:, None] * _shared(context)
 
 
@@ -186,11 +187,9 @@ def _shared(context: Mapping[str, Any]) -> Complex[Array, "*link_snapshot_rx_tx_
 
 
 def _response(
-    context: Mapping[str, Any], name: str, direction: Float[Array, "link 3"], sign: float
+    context: Mapping[str, Any], side: str, direction: Float[Array, "link 3"], sign: float
 ) -> Complex[Array, "link antenna"]:
-    array = context.get(name)
-    positions = jnp.zeros((1, 3)) if array is None else jnp.asarray(array)
-    return steering(positions, direction[:, None], context["paths"].frequency, sign)[:, 0]
+    return steering(positions(context, side), direction[:, None], context["paths"].frequency, sign)[:, 0]
 
 
 def _leg(start: Any, stop: Any) -> tuple[jax.Array, jax.Array]:

@@ -48,7 +48,7 @@ def _elsewhere(side: str, basis: np.ndarray) -> Rewrite:
     """The phase of every element at its new place."""
     return phase_rewrite(
         side,
-        lambda p, k, r, _: jnp.einsum("...x,ax->...a", k, turned(r, p["rotation"] @ jnp.asarray(basis))),
+        lambda p, k, r: jnp.einsum("...x,ax->...a", k, turned(r, p["rotation"] @ jnp.asarray(basis))),
     )
 
 

@@ -12,7 +12,7 @@ import numpyro.distributions as dist
 from jaxtyping import Array, Complex, Float
 from scipy.constants import speed_of_light
 
-from dtprob.effects.common import Data, Sites, half_normal, offers
+from dtprob.effects.common import Data, Sites, half_normal, offers, phasor
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.raytracing.paths import NONE, REFRACTION, PathSet
 
@@ -110,7 +110,7 @@ def _removed(paths: PathSet, width: Any, azimuth: Any, distance: Any) -> Complex
     strength = strength * jax.lax.rsqrt(jnp.sqrt(1 + bend**2))
     size = width * strength * jnp.exp(-aside)
     phase = aside * bend + np.pi / 4 - jnp.arctan(bend) / 2 - 2 * np.pi * detour / wavelength
-    field = jax.lax.complex(size * jnp.cos(phase), size * jnp.sin(phase))
+    field = size * phasor(phase)
     free = jax.nn.sigmoid((_first_leg(paths) - distance) / (0.1 * distance))
     return jnp.where(is_seen, free * field, 0.0)
 

@@ -32,7 +32,9 @@ class Programs:
         self._arrays, self._static = split_static(data)
         means = [e for e in effects if e.kind == "mean" and e.rewrites]
         fields = [e for e in effects if e.kind == "variance"]
-        families = {e.family: [other for other in means if other.family == e.family] for e in means}
+        families: dict[str, list[Effect]] = {}
+        for effect in means:
+            families.setdefault(effect.family, []).append(effect)
 
         def energy(
             values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], arrays: Any
@@ -41,6 +43,7 @@ class Programs:
             return {e.name: _field_energy(e, values, gradients, context) for e in fields}
 
         self._energy = Hoisted(energy)
+        self._families = {family: [e.name for e in own] for family, own in families.items()}
         self._tangents = {family: self._tangents_of(own) for family, own in families.items()}
         self._trials = {family: self._trials_of(own) for family, own in families.items()}
         self._place_scores: dict[str, Hoisted] = {}
@@ -77,15 +80,11 @@ class Programs:
             values: of the sites.
             effects: the candidates; those that have been given another null than at first are taken there.
         """
-        own = {e.name: null_vector(e) for e in effects if e.name in self._nulls}
+        nulls = self._nulls | {e.name: null_vector(e) for e in effects if e.name in self._nulls}
         found: dict[str, dict[str, jax.Array]] = {}
-        for family, run in self._tangents.items():
-            found |= run(dict(values), self._of({**self._nulls, **own}, family), self._arrays)
+        for family, names in self._families.items():
+            found |= self._tangents[family](dict(values), {n: nulls[n] for n in names}, self._arrays)
         return found
-
-    def _of(self, by_name: Mapping[str, Any], family: str) -> dict[str, Any]:
-        """What belongs to the effects of a family."""
-        return {name: value for name, value in by_name.items() if self._means[name].family == family}
 
     def place_scores(
         self,
@@ -119,12 +118,12 @@ class Programs:
             name, which of its trials, and for each site the shifts (trial, *site); all effects in portions of one
             size, so that nothing is compiled anew.
         """
-        for family, run in self._trials.items():
-            wanted = self._of(sizes, family)
+        for family, names in self._families.items():
+            wanted = {n: sizes[n] for n in names if n in sizes}
             for start in range(0, max((len(v) for v in wanted.values()), default=0), TRIALS):
                 portion = {n: v[start : start + TRIALS] for n, v in wanted.items() if len(v) > start}
-                filled = {n: self._filled(n, portion) for n in self._of(self._nulls, family)}
-                shifts = run(dict(values), filled, self._arrays)
+                filled = {n: self._filled(n, portion) for n in names}
+                shifts = self._trials[family](dict(values), filled, self._arrays)
                 for name, part in portion.items():
                     moved = {site: shift[: len(part)] for site, shift in shifts[name].items()}
                     yield name, slice(start, start + len(part)), moved

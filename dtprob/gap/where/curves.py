@@ -132,7 +132,8 @@ def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quant
 
     Each of its values at each position of the last axis, and what it holds along the last axis all together.
     """
-    if not (np.issubdtype(values.dtype, np.integer) or values.dtype == bool) or values.ndim < 2:
+    whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool
+    if not whole or values.ndim < 2 or (values == values.flat[0]).all():
         return
     last = values.shape[-1]
     each = last * np.unique(values, return_inverse=True)[1].reshape(values.shape) + np.arange(last)

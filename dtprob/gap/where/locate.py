@@ -7,6 +7,7 @@ all families of all sites.
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
@@ -117,7 +118,7 @@ def _further_looks(
 ) -> Iterator[tuple[int, tuple[float, float]]]:
     """How many times more replicates another look takes, and between which p-values of the look before it is taken."""
     most = drawn.most(settings.site_times)
-    second = min(-(-_MORE // max(drawn.at_sites, 1)), most)
+    second = min(math.ceil(_MORE / max(drawn.at_sites, 1)), most)
     if second > 1:
         yield second, _OPEN_WHERE_SHOWN if shown else _OPEN_AT_FIRST
     if most > second:

@@ -87,7 +87,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         others = _forward(end.problem, rest, key, settings, say, base=base, banned=field)
         ways.append([*steps[:-1], *others])
     reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
-    pair = promising(ways, reached - base.log_evidence, settings)
+    pair = _promising(ways, reached - base.log_evidence, settings)
     if pair is not None:
         say(f"starting from {pair[0]} and {pair[1]} together")
         both = _refitted_with(steps[0].view, pair, settings)
@@ -104,7 +104,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
 
 
-def promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
+def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
     """The pair that promises most to first order, if it promises more than one effect, and as much as was reached.
 
     None where a way ended with it. First order understates: the base fit's spread holds the gap too. It overstates what

@@ -54,6 +54,7 @@ def test_whole_numbers_on_several_axes_make_groups_of_each_and_of_all():
 def test_groups_are_of_whole_numbers_that_come_often():
     assert not list(groups("level", ("link", "place"), np.zeros((10, 40))))
     assert not list(groups("device", ("link",), np.arange(10)))
+    assert not list(groups("valid", ("link", "place"), np.ones((10, 40), bool)))
     (each, together) = groups("code", ("link", "place"), np.arange(400).reshape(200, 2))
     assert not list(each.curves())
     assert not list(together.curves())

@@ -10,8 +10,9 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.where.curves import Quantity, curves, cycles, quantity
+from dtprob.gap.where.curves import Quantity, curves, cycles, groups, quantity
 from dtprob.gap.where.families import deterministic, families, observed, shifted
+from dtprob.gap.where.family_test import family_test
 from tests.unit.gap.examples import bend, draw, line
 
 LENGTH = 40
@@ -166,6 +167,26 @@ def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
     assert np.count_nonzero(scores) == 1
     step = family.step(scores[0], np.full(scores.shape[1], 24.0), site.value)
     np.testing.assert_allclose(step, value, atol=1e-12)
+
+
+def test_what_whole_numbers_tell_apart_is_told_of_each_outcome(problem):
+    """What a device did last tilts the odds between its outcomes, which sum to nothing over them."""
+    rng = np.random.default_rng(5)
+    last = rng.integers(0, 2, (30, 10, 2))
+    gradients = rng.normal(size=(60, 30, 10, 2, 2))
+    gradients[0] += 0.3 * np.where(last == 1, 1.0, -1.0)[..., None] * np.array([-1.0, 1.0])
+    site = deterministic(
+        "odds", ("window", "slot", "device", "outcome"), np.ones(gradients.shape[1:]), gradients
+    )
+    over = [(q, tuple(q.curves())) for q in groups("last", site.axes[:3], last)]
+    found = {f.label: family_test(f, s) for f, s in families(partial(curves, problem), over, site)}
+    each = found["additive, by value of last of each device x outcome"]
+    assert each.variance.shape == (8,)
+    assert each.p_value < 1e-12
+    assert found["additive, by value of last of all x device x outcome"].variance.shape == (16,)
+    assert found["additive, by value of last of each device"].p_value > 1e-3
+    step = each.family.step(each.first[0], each.variance, site.value)
+    assert np.corrcoef(step.ravel(), (gradients[0] - gradients[1:].mean(0)).ravel())[0, 1] > 0.2
 
 
 def test_short_axes_have_no_curves(problem):

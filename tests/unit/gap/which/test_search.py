@@ -7,7 +7,7 @@ import pytest
 
 from dtprob.gap.settings import Settings
 from dtprob.gap.which.pairs import Pair
-from dtprob.gap.which.search import promising
+from dtprob.gap.which.search import _promising
 
 TILT_AND_NOISE, TILT_AND_SHIFT = Pair(("noise", "tilt"), 900.0), Pair(("shift", "tilt"), 880.0)
 
@@ -29,20 +29,20 @@ def way(effects, *, leaves, pairs=(TILT_AND_NOISE, TILT_AND_SHIFT)):
 
 
 def test_noise_is_no_start_where_what_moves_the_mean_leaves_nothing():
-    assert promising([way(("gain",), leaves=False)], 800.0, Settings()) == ("shift", "tilt")
+    assert _promising([way(("gain",), leaves=False)], 800.0, Settings()) == ("shift", "tilt")
     only_noise = way(("gain",), leaves=False, pairs=(TILT_AND_NOISE,))
-    assert promising([only_noise], 800.0, Settings()) is None
+    assert _promising([only_noise], 800.0, Settings()) is None
 
 
 @pytest.mark.parametrize(("effects", "leaves"), [(("gain",), True), (("noise",), False)])
 def test_noise_is_a_start_where_something_is_left_or_noise_was_needed(effects, leaves):
-    assert promising([way(effects, leaves=leaves)], 800.0, Settings()) == ("noise", "tilt")
+    assert _promising([way(effects, leaves=leaves)], 800.0, Settings()) == ("noise", "tilt")
 
 
 @pytest.mark.parametrize(("effects", "reached"), [(("noise", "tilt"), 800.0), (("gain",), 1500.0), ((), 0.0)])
 def test_no_pair_that_was_reached_or_promises_less_or_where_nothing_was_found(effects, reached):
-    assert promising([way(effects, leaves=True)], reached, Settings()) is None
+    assert _promising([way(effects, leaves=True)], reached, Settings()) is None
 
 
 def test_no_pair_where_one_effect_is_all_that_is_looked_for():
-    assert promising([way(("gain",), leaves=True)], 800.0, Settings(max_effects=1)) is None
+    assert _promising([way(("gain",), leaves=True)], 800.0, Settings(max_effects=1)) is None
