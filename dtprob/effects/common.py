@@ -70,6 +70,12 @@ def half_normal(name: str, scale: float, unit: str = "1") -> Parameter:
     return Parameter(name, dist.HalfNormal(scale, validate_args=False), 0.0, unit)
 
 
+def place(name: str, tried: Float[np.ndarray, " n"], unit: str, *, centre: float, spread: float) -> Parameter:
+    """Where an effect acts, N(centre, spread^2), looked for at the tried values."""
+    prior = dist.Normal(centre, spread)
+    return Parameter(name, prior, centre, unit, is_place=True, tried=tuple(tried.tolist()))
+
+
 def offers(sites: Sites, *names: str) -> bool:
     """Whether the model computes all these sites."""
     return all(name in sites and sites[name].kind == "deterministic" for name in names)

@@ -107,8 +107,9 @@ class Effect:
         parameters: the effect's parameters.
         instance: which object, antenna, band or device; None where there is only one.
         kind: "mean" for parameters that shift the site's value; "variance" for a random field whose standard
-            deviation is the (single, non-negative) parameter: the rewrites then also get parameters["field"],
-            standard normal, drawn once per run and shared by all the sites that the effect rewrites.
+            deviation is the (single, non-negative) size, beside places perhaps that it is looked for at: the rewrites
+            then also get parameters["field"], standard normal, drawn once per run and shared by all the sites that
+            the effect rewrites.
         physics: one line of what it is.
         source: where the formula comes from.
         requires: names of data or sites that the rewrites look up in the context.
@@ -141,18 +142,21 @@ class Effect:
             got = ", ".join(names) or "none"
             raise InputError(f"effect {self.name}", "parameters of different names", got, "Name each once.")
         n_size = sum(p.size for p in self.parameters if not p.is_place)
-        if self.is_looked_for and (self.kind == "variance" or self.distributions or n_size != 1):
+        if self.is_looked_for and (self.distributions or n_size != 1):
             raise InputError(
                 f"effect {self.name} with places that are tried",
-                "a mean effect of one size that rewrites deterministic sites",
-                f"{self.kind}, {n_size} sizes, distributions of {', '.join(self.distributions) or 'no site'}",
+                "an effect of one size that rewrites deterministic sites",
+                f"{n_size} sizes, distributions of {', '.join(self.distributions) or 'no site'}",
                 "Leave tried out, or split the effect.",
             )
         shapeless = bool(self.distributions) and self.field_shape is None
-        if self.kind == "variance" and (len(names) != 1 or shapeless):
+        fixed = any(p.is_place and not p.tried for p in self.parameters)
+        spread_out = self.is_looked_for and len(self.rewrites) != 1
+        if self.kind == "variance" and (n_size != 1 or fixed or spread_out or shapeless):
             raise InputError(
                 f"variance effect {self.name}",
-                "one parameter, the field's standard deviation, and a field_shape where it rewrites a distribution",
+                "one size, the field's standard deviation, tried values of each place and then one site, and a field_shape"
+                " where it rewrites a distribution",
                 f"{', '.join(names)}; distributions of {', '.join(self.distributions) or 'no site'}",
                 "Split it into several effects, say the shape of its field, or make it a mean effect.",
             )
@@ -171,6 +175,11 @@ class Effect:
     def is_looked_for(self) -> bool:
         """Whether it may act anywhere, and is looked for at many places before it is fitted."""
         return any(p.tried for p in self.parameters)
+
+    @property
+    def fitted(self) -> tuple[Parameter, ...]:
+        """Parameters that a fit moves: of a variance effect the places, since its size is the spread of its field."""
+        return tuple(p for p in self.parameters if self.kind == "mean" or p.is_place)
 
     @property
     def dimension(self) -> int:

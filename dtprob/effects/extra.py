@@ -17,6 +17,7 @@ from jaxtyping import Array, Complex, Float
 from scipy.constants import speed_of_light
 
 from dtprob.effects.common import (
+    Band,
     Data,
     Family,
     Sites,
@@ -30,6 +31,7 @@ from dtprob.effects.common import (
     normal,
     offers,
     phasor,
+    place,
     positions,
     touched_objects,
 )
@@ -40,13 +42,20 @@ from dtprob.raytracing.paths import NONE, PathSet
 _NEEDS: Final = ("paths", "subcarrier_frequency", "path_phase", "frequency_response")
 _TAPS: Final = 16
 """Taps of the diffuse tail at most."""
+_AXES: Final = ("x", "y", "z")
+_STEP: Final = 2.0
+"""Step in m between places of a scatterer where nothing tells delays apart."""
+_MOST: Final = 600
+"""Places of a scatterer in the plane, about."""
+_HEIGHTS: Final = 3
+"""Heights of a scatterer that are tried."""
 
 
 def extra_path(sites: Sites, data: Data) -> list[Effect]:
-    """An object also scatters as a point: a path over the centre of its reflections to every link."""
+    """Something scatters as a point to every link: an object in the scene, or what it lacks, wherever that stands."""
     if not _sums_paths(sites) or data.get("paths") is None:
         return []
-    effects = []
+    effects = [_over_any_point(data["paths"], band(data))]
     for index, name in touched_objects(data):
         paths: PathSet = data["paths"]
         centre = np.asarray(paths.vertex)[np.asarray(meets(paths, index))].mean(axis=0)
@@ -54,11 +63,7 @@ def extra_path(sites: Sites, data: Data) -> list[Effect]:
         def scatter(
             value: Any, p: Mapping[str, Any], context: Mapping[str, Any], centre: Any = centre
         ) -> Any:
-            paths = context["paths"]
-            first, second = _leg(paths.tx_position, centre), _leg(centre, paths.rx_position)
-            loss = paths.wavelength / ((4 * jnp.pi) ** 1.5 * first[1] * second[1])
-            path = _path(context, first[0], second[0], first[1] + second[1])
-            return value + complex_of(p["scattering"]) * loss[:, None, None, None, None] * path
+            return value + complex_of(p["scattering"]) * _echo(context, centre)
 
         effects.append(
             Effect(
@@ -73,6 +78,50 @@ def extra_path(sites: Sites, data: Data) -> list[Effect]:
             )
         )
     return effects
+
+
+def _over_any_point(paths: PathSet, measured: Band | None) -> Effect:
+    """The path over a point that is looked for, with a gain of its own for each link: its phase is not told by metres."""
+    low, high = _region(paths)
+    step = _STEP if measured is None else speed_of_light / (2 * measured.width)
+    step = max(step, float(np.sqrt(np.prod((high - low)[:2]) / _MOST)), 1e-3)
+    tried = [low[i] + step * np.arange(int((high[i] - low[i]) / step) + 1) for i in range(2)]
+    tried.append(np.linspace(low[2], high[2], _HEIGHTS) if high[2] - low[2] > step / 2 else low[2:])
+
+    def scatter(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        point, paths = jnp.stack([p[axis] for axis in _AXES]), context["paths"]
+        length = _leg(paths.tx_position, point)[1] + _leg(point, paths.rx_position)[1]
+        # The random phase takes up that of the carrier, which turns with every wavelength that the point moves.
+        turned = phasor(2 * jnp.pi * length / paths.wavelength)[:, None, None, None, None]
+        return value + p["scale"] / jnp.sqrt(2.0) * complex_of(p[FIELD]) * turned * _echo(context, point)
+
+    middles, spreads = (low + high) / 2, np.maximum((high - low) / np.sqrt(12), step)
+    return Effect(
+        "extra_path",
+        {"noiseless_channel": scatter},
+        (
+            half_normal("scale", 1.0, "m"),
+            *(
+                place(axis, values, "m", centre=float(middle), spread=float(spread))
+                for axis, values, middle, spread in zip(_AXES, tried, middles, spreads, strict=True)
+            ),
+        ),
+        instance="anywhere",
+        kind="variance",
+        physics="Something that the scene lacks scatters to all links, with a random complex gain for each; the size is the"
+        " root of the mean radar cross section.",
+        source="Bistatic radar equation: lambda sqrt(sigma) / ((4 pi)^(3/2) r1 r2); Swerling, fluctuating targets.",
+        requires=_NEEDS,
+        field_shape=lambda value, _: (value.shape[0], 1, 1, 1, 1, 2),
+    )
+
+
+def _region(paths: PathSet) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
+    """Lowest and highest corner of where links end and their paths are turned."""
+    mask, kinds = np.asarray(paths.mask), np.asarray(paths.interaction)
+    turned = np.asarray(paths.vertex)[mask[..., None] & (kinds != NONE)].reshape(-1, 3)
+    points = np.concatenate([np.asarray(paths.tx_position), np.asarray(paths.rx_position), turned])
+    return points.min(axis=0), points.max(axis=0)
 
 
 def diffraction(sites: Sites, data: Data) -> list[Effect]:
@@ -164,6 +213,16 @@ def _towards(context: Mapping[str, Any], near: str | None) -> jax.Array:
 
 def _sums_paths(sites: Sites) -> bool:
     return has_phase(sites) and offers(sites, "path_phase", "frequency_response")
+
+
+def _echo(
+    context: Mapping[str, Any], point: Any
+) -> Complex[Array, "link 1 rx_antenna tx_antenna subcarrier"]:
+    """What a point of radar cross section 1 m^2 scatters to each link."""
+    paths = context["paths"]
+    first, second = _leg(paths.tx_position, point), _leg(point, paths.rx_position)
+    loss = paths.wavelength / ((4 * jnp.pi) ** 1.5 * first[1] * second[1])
+    return loss[:, None, None, None, None] * _path(context, first[0], second[0], first[1] + second[1])
 
 
 def _path(

@@ -8,12 +8,11 @@ from typing import Any, Final
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from jaxtyping import Array, Complex, Float
 from scipy.constants import speed_of_light
 
-from dtprob.effects.common import Data, Sites, half_normal, offers, phasor
-from dtprob.effects.effect import Effect, Parameter
+from dtprob.effects.common import Data, Sites, half_normal, offers, phasor, place
+from dtprob.effects.effect import Effect
 from dtprob.raytracing.paths import NONE, REFRACTION, PathSet
 
 _SHARES: Final = (0.03, 0.4)
@@ -62,8 +61,8 @@ def _pole(transmitter: np.ndarray, middle: float, frequency: float, instance: st
         {"path_gain": shade},
         (
             half_normal("width", 0.5, "m"),
-            _place("azimuth", 0.0, np.pi / np.sqrt(3), azimuths, "rad"),
-            _place("distance", usual, float(distances.std()), distances, "m"),
+            place("azimuth", azimuths, "rad", centre=0.0, spread=np.pi / np.sqrt(3)),
+            place("distance", distances, "m", centre=usual, spread=float(distances.std())),
         ),
         instance=instance,
         physics="A pole or trunk that the scene lacks, this far from the transmitter, takes away the wave that would pass"
@@ -71,12 +70,6 @@ def _pole(transmitter: np.ndarray, middle: float, frequency: float, instance: st
         source="Babinet's principle: what passes exp(-pi x^2 / w^2) is gone, int exp(-j k (r1(x) + r2(x) - r)) dx "
         "sqrt(j (1/r1 + 1/r2) / wavelength) (1 + cos b) / 2, b the turn; Born & Wolf, Principles of Optics, 8.3.",
         requires=("paths",),
-    )
-
-
-def _place(name: str, centre: float, spread: float, tried: np.ndarray, unit: str) -> Parameter:
-    return Parameter(
-        name, dist.Normal(centre, spread), centre, unit, is_place=True, tried=tuple(tried.tolist())
     )
 
 

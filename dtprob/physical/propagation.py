@@ -150,7 +150,7 @@ def diffuse_scattering(
         flat = np.tile(each.reshape(*each.shape[:2], -1), (1, 1, len(sounding.snapshot_time)))
         return np.concatenate([flat, 1j * flat], axis=1)
 
-    return Impairment("diffuse_scattering", "1", limit, rays=scatter, spread=spread)
+    return Impairment("diffuse_scattering", "1", limit, "near_receiver", rays=scatter, spread=spread)
 
 
 def atmospheric_attenuation(limit: float = 0.5) -> Impairment:

@@ -109,7 +109,9 @@ def test_a_variance_effect_follows_its_quadratic_form(problem):
     form = left @ member @ member.T @ left
     mean, variance = np.trace(form), 2 * np.trace(form @ form)
     energy = problem.programs.field_energy(
-        {n: np.asarray(v) for n, v in problem.compiled.sites(fitted.x).items()}, drawn.gradients
+        {n: np.asarray(v) for n, v in problem.compiled.sites(fitted.x).items()},
+        drawn.gradients,
+        problem.effects,
     )["jitter"]
     energy = energy[:, 0]
     null = energy[1:]

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import prior_scale, scales
+from dtprob.gap.fitting.plausible import prior_scale, scales, sizes
 from dtprob.gap.model.layout import Block
 from dtprob.gap.model.problem import Problem
 
@@ -82,7 +82,7 @@ def means_among(problem: Problem, names: Collection[str]) -> list[str]:
 
 def _first_spread(effect: Effect) -> float:
     """A tenth: in the field's own unit or, where that is more, of its largest plausible standard deviation."""
-    return _FAINT * max(1.0, float(scales(effect).max()))
+    return _FAINT * max(1.0, float(scales(effect)[sizes(effect)].max()))
 
 
 def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
@@ -91,14 +91,12 @@ def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float
     gradient, curvature = np.zeros(problem.dimension), np.zeros(problem.dimension)
     for effect in active.effects:
         if effect.kind == "variance":
-            sd = active.spread[effect.name]
-            for block in problem.blocks_of(effect.name):
-                w = x[block.index]
-                total += float(-0.5 * np.sum(w**2) / sd**2 - w.size * (np.log(sd) + 0.5 * LOG_2PI))
-                gradient[block.index] = -w / sd**2
-                curvature[block.index] = 1 / sd**2
-            continue
-        for parameter in effect.parameters:
+            sd, block = active.spread[effect.name], problem.field_of(effect)
+            w = x[block.index]
+            total += float(-0.5 * np.sum(w**2) / sd**2 - w.size * (np.log(sd) + 0.5 * LOG_2PI))
+            gradient[block.index] = -w / sd**2
+            curvature[block.index] = 1 / sd**2
+        for parameter in effect.fitted:
             block = problem.layout[effect.site_name(parameter.name)]
             value = jnp.asarray(x[block.index[0]]).reshape(parameter.shape)
             sd = np.asarray(prior_scale(parameter.prior)) * np.ones(parameter.shape)

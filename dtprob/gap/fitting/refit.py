@@ -32,13 +32,21 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
         problem: in which the effect is live.
         fitted: the fit without it.
         effect: what is added.
-        starts: flat vectors; not looked at for a variance effect, whose field starts at zero.
+        starts: flat vectors; not looked at for a variance effect, whose field starts at zero where it was found.
     """
     names = (*fitted.effects, effect.name)
     if effect.kind == "variance":
-        return fitting.fit(problem, fitted.x, names)
+        return fitting.fit(problem, _at_its_place(problem, fitted.x, effect), names)
     best = max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
     return settled(problem, best)
+
+
+def _at_its_place(problem: Problem, x: np.ndarray, effect: Effect) -> np.ndarray:
+    """The point with an effect at its null: its place may have moved since it was last tried."""
+    x, null = x.copy(), problem.null()
+    for block in problem.blocks_of(effect.name):
+        x[block.index] = null[block.index]
+    return x
 
 
 def polished(
@@ -105,8 +113,7 @@ def starting_points(
         return []
     index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
     scale, sided = scales(effect), sides(effect)
-    x = x.copy()
-    x[index] = nulls(effect)  # a place may have moved since the effect was last tried
+    x = _at_its_place(problem, x, effect)
     one_step = x.copy()
     if step is not None:
         moved = np.clip(step, -4 * scale, 4 * scale)

@@ -34,10 +34,10 @@ def respread(
     own[active.global_index] = np.diag(np.linalg.inv(positive(system.curvature)))
     if active.local_index.size:
         own[active.local_index] = np.einsum("cii->ci", np.linalg.inv(positive(system.local)))
-    for name, sd in active.spread.items():
-        blocks = problem.blocks_of(name)
-        kept = [b.index[active.weights > 0] if b.local else b.index for b in blocks]
-        index = np.concatenate([i.reshape(-1) for i in kept])
+    for effect in (e for e in active.effects if e.kind == "variance"):
+        name, block = effect.name, problem.field_of(effect)
+        sd = active.spread[name]
+        index = (block.index[active.weights > 0] if block.local else block.index).reshape(-1)
         determined = max(float(np.sum(1 - own[index] / sd**2)), _FEWEST)
         step = float(np.log(np.sqrt(np.sum(x[index] ** 2) / determined) / sd + 1e-300))
         shrink = step / latest[name] if latest.get(name) else 0.0

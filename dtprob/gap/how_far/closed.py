@@ -132,7 +132,7 @@ def floor(problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: f
         remaining_gain: nats that moving any one site freely would still gain, 0 where nothing is significant.
         n_folds: K.
     """
-    size = sum(e.dimension if e.kind == "mean" else 1 for e in problem.effects if e.name in full.effects)
+    size = sum(e.dimension for e in problem.effects if e.name in full.effects)
     reached = float(after.log_likelihood.sum())
     return Floor(reached, reached + max(remaining_gain, 0.0), size, cost(size, n_folds))
 

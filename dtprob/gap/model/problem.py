@@ -226,6 +226,10 @@ class Problem:
         """The blocks of a live effect by its name, or of the base model's nuisances."""
         return [block for block in self.layout.blocks if block.owner == owner]
 
+    def field_of(self, effect: Effect) -> Block:
+        """The block of a live variance effect's field."""
+        return self.layout[effect.site_name(FIELD)]
+
     @cached_property
     def float_sites(self) -> dict[str, jax.ShapeDtypeStruct]:
         """Deterministic sites on which a perturbation makes sense, in the largest shape that a candidate gives them."""
@@ -249,8 +253,7 @@ class Problem:
                 of_site = self.declaration.sites[effect.sites[0]].axes
                 axes = own if effect.name in self.per_cluster else of_site
                 entries.append((effect.site_name(FIELD), effect.name, self.field_shapes[effect.name], axes))
-            else:
-                entries += [(effect.site_name(p.name), effect.name, p.shape, ()) for p in effect.parameters]
+            entries += [(effect.site_name(p.name), effect.name, p.shape, ()) for p in effect.fitted]
         return make_layout(entries, str(self.declaration.cluster), self.rows.n_cluster)
 
     # -- points ---------------------------------------------------------------------------------------------------
@@ -259,7 +262,7 @@ class Problem:
         """The flat vector with live effects at their null and latent sites at zero."""
         x = np.zeros(self.dimension)
         for effect in self.live:
-            for parameter in effect.parameters if effect.kind == "mean" else ():
+            for parameter in effect.fitted:
                 self.layout.put(x, effect.site_name(parameter.name), np.full(parameter.shape, parameter.null))
         return x
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, Final
 
 import equinox as eqx
@@ -19,6 +19,8 @@ TRIALS: Final = 16
 """Sizes of each effect that are tried in one run."""
 _PLACES: Final = 96
 """Places of an effect whose tangents are held at once."""
+_HELD: Final = 10_000_000
+"""Numbers that the tangents of a field at several places may take."""
 
 
 class Programs:
@@ -37,18 +39,21 @@ class Programs:
             families.setdefault(effect.family, []).append(effect)
 
         def energy(
-            values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], arrays: Any
+            values: Mapping[str, jax.Array],
+            gradients: Mapping[str, jax.Array],
+            nulls: Mapping[str, jax.Array],
+            arrays: Any,
         ) -> dict[str, jax.Array]:
             context = Context(eqx.combine(arrays, self._static), values)
-            return {e.name: _field_energy(e, values, gradients, context) for e in fields}
+            return {e.name: _field_energy(e, values, gradients, nulls[e.name], context) for e in fields}
 
         self._energy = Hoisted(energy)
         self._families = {family: [e.name for e in own] for family, own in families.items()}
         self._tangents = {family: self._tangents_of(own) for family, own in families.items()}
         self._trials = {family: self._trials_of(own) for family, own in families.items()}
         self._place_scores: dict[str, Hoisted] = {}
-        self._means = {e.name: e for e in means}
-        self._nulls = {e.name: np.asarray(null_vector(e)) for e in means}
+        self._effects = {e.name: e for e in (*means, *fields)}
+        self._nulls = {name: np.asarray(null_vector(e)) for name, e in self._effects.items()}
 
     def _tangents_of(self, effects: Sequence[Effect]) -> Hoisted:
         def tangents(
@@ -80,11 +85,14 @@ class Programs:
             values: of the sites.
             effects: the candidates; those that have been given another null than at first are taken there.
         """
-        nulls = self._nulls | {e.name: null_vector(e) for e in effects if e.name in self._nulls}
+        nulls = self._nulls_of(effects)
         found: dict[str, dict[str, jax.Array]] = {}
         for family, names in self._families.items():
             found |= self._tangents[family](dict(values), {n: nulls[n] for n in names}, self._arrays)
         return found
+
+    def _nulls_of(self, effects: Sequence[Effect]) -> dict[str, Any]:
+        return self._nulls | {e.name: null_vector(e) for e in effects if e.name in self._nulls}
 
     def place_scores(
         self,
@@ -93,7 +101,7 @@ class Programs:
         gradients: Mapping[str, jax.Array],
         points: Float[np.ndarray, "place parameter"],
     ) -> Float[np.ndarray, "place n"]:
-        """Scores of an effect of one size at each of its places.
+        """Scores of an effect of one size at each of its places; of a random field the energies, entries weighed alike.
 
         Args:
             name: of the effect.
@@ -104,7 +112,9 @@ class Programs:
 
         def scores(values: Any, gradients: Any, points: jax.Array, arrays: Any) -> jax.Array:
             context = Context(eqx.combine(arrays, self._static), values)
-            return _place_scores(self._means[name], values, gradients, points, context)
+            effect = self._effects[name]
+            told = _place_scores if effect.kind == "mean" else _place_energies
+            return told(effect, values, gradients, points, context)
 
         run = self._place_scores.setdefault(name, Hoisted(scores, jax.jit))
         return np.asarray(run(dict(values), dict(gradients), points, self._arrays))
@@ -136,15 +146,19 @@ class Programs:
         return rows
 
     def field_energy(
-        self, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array]
+        self,
+        values: Mapping[str, jax.Array],
+        gradients: Mapping[str, jax.Array],
+        effects: Sequence[Effect],
     ) -> dict[str, np.ndarray]:
         """Weighted sums of squared field scores (n, weighting) of each variance effect, the first with equal weights.
 
         Args:
             values: of the sites, at the fit.
             gradients: of the data and then of replicates under the fit, (n, *site) for each site.
+            effects: the candidates; those that may act anywhere do so where their null is now.
         """
-        found = self._energy(dict(values), dict(gradients), self._arrays)
+        found = self._energy(dict(values), dict(gradients), self._nulls_of(effects), self._arrays)
         return {name: np.asarray(value) for name, value in found.items()}
 
 
@@ -213,25 +227,83 @@ def _trial_shifts(
     return jax.vmap(one)(sizes)
 
 
-def _field_energy(
-    effect: Effect, values: Mapping[str, jax.Array], gradients: Mapping[str, jax.Array], context: Context
+def _place_energies(
+    effect: Effect,
+    values: Mapping[str, jax.Array],
+    gradients: Mapping[str, jax.Array],
+    points: jax.Array,
+    context: Context,
 ) -> jax.Array:
+    """As `_squares` and a sum, by products of matrices: an entry of the field moves its own part of the site alone."""
+    (site,) = effect.rewrites
+    shape, of_site = effect.shape_of_field(values[site], context), gradients[site].shape[1:]
+    rank, free = len(of_site), shape[len(of_site) :]
+    own = [i for i in range(rank) if shape[i] == of_site[i]]
+    order = [*own, *(i for i in range(rank) if i not in own)]
+    parts = int(np.prod([of_site[i] for i in own], dtype=int))
+    count = int(np.prod(free, dtype=int))
+    units = jnp.eye(count).reshape(count, *(1,) * rank, *free) * jnp.ones(shape)
+
+    def arranged(entries: jax.Array) -> jax.Array:
+        """(n, *site) -> (n, part, rest), real and imaginary parts one after another."""
+        flat = entries.transpose(0, *(1 + i for i in order)).reshape(len(entries), parts, -1)
+        return jnp.concatenate([flat.real, flat.imag], axis=-1) if jnp.iscomplexobj(flat) else flat
+
+    pulled = arranged(jnp.conj(gradients[site]))
+
+    def one(point: jax.Array) -> jax.Array:
+        moved = _with_field(effect, values, {site: gradients[site]}, point, context)
+        along = jax.vmap(lambda unit: jax.jvp(moved, (jnp.zeros(shape),), (unit,))[1][site])(units)
+        return jnp.sum(jnp.einsum("npr,fpr->npf", pulled, arranged(along)) ** 2, axis=(1, 2))
+
+    held = max(_HELD // (gradients[site][0].size * count), 1)
+    return jax.lax.map(one, points, batch_size=min(held, _PLACES))
+
+
+def _squares(
+    effect: Effect,
+    values: Mapping[str, jax.Array],
+    gradients: Mapping[str, jax.Array],
+    null: jax.Array,
+    context: Context,
+) -> Callable[[Mapping[str, jax.Array]], jax.Array]:
+    """The function from gradients at the sites of one data set to the squared scores of a field's entries."""
     shape = effect.shape_of_field(values[effect.sites[0]], context)
-    unit = {p.name: jnp.ones(p.shape) for p in effect.parameters}
-    sites = [site for site in effect.rewrites if site in gradients]
+    _, pull = jax.vjp(_with_field(effect, values, gradients, null, context), jnp.zeros(shape))
+    return lambda gradient: pull(gradient)[0] ** 2
+
+
+def _with_field(
+    effect: Effect,
+    values: Mapping[str, jax.Array],
+    gradients: Mapping[str, jax.Array],
+    null: jax.Array,
+    context: Context,
+) -> Callable[[jax.Array], dict[str, jax.Array]]:
+    """The function from a field of unit spread to the sites, those that have gradients, its places where the null is."""
+    at = unflatten(effect, null)
+    unit = {p.name: at[p.name] if p.is_place else jnp.ones(p.shape) for p in effect.parameters}
 
     def moved(field: jax.Array) -> dict[str, jax.Array]:
         result = {}
-        for site in sites:
+        for site, gradient in gradients.items():
             new = jnp.asarray(effect.rewrites[site](values[site], {**unit, FIELD: field}, context))
-            result[site] = jnp.broadcast_to(new.astype(values[site].dtype), gradients[site].shape[1:])
+            result[site] = jnp.broadcast_to(new.astype(values[site].dtype), gradient.shape[1:])
         return result
 
-    _, pull = jax.vjp(moved, jnp.zeros(shape))
-    chosen = {site: gradients[site] for site in sites}
+    return moved
 
-    def square(gradient: Mapping[str, jax.Array]) -> jax.Array:
-        return pull(gradient)[0] ** 2
+
+def _field_energy(
+    effect: Effect,
+    values: Mapping[str, jax.Array],
+    gradients: Mapping[str, jax.Array],
+    null: jax.Array,
+    context: Context,
+) -> jax.Array:
+    shape = effect.shape_of_field(values[effect.sites[0]], context)
+    chosen = {site: gradients[site] for site in effect.rewrites if site in gradients}
+    square = _squares(effect, values, chosen, null, context)
 
     def add(total: jax.Array, gradient: Mapping[str, jax.Array]) -> tuple[jax.Array, None]:
         return total + square(gradient), None

@@ -142,12 +142,10 @@ class Runner:
     def _parameters(self, x: Any) -> dict[str, dict[str, Any]]:
         parameters: dict[str, dict[str, Any]] = {}
         for effect in self.live:
-            if effect.kind == "mean":
-                names = {p.name: effect.site_name(p.name) for p in effect.parameters}
-                parameters[effect.name] = {name: self.layout.part(x, site) for name, site in names.items()}
-            else:
-                unit = {p.name: jnp.ones(p.shape) for p in effect.parameters}
-                parameters[effect.name] = {**unit, FIELD: self.layout.part(x, effect.site_name(FIELD))}
+            unit = {p.name: jnp.ones(p.shape) for p in effect.parameters}
+            names = [*(p.name for p in effect.fitted), *([FIELD] if effect.kind == "variance" else [])]
+            parts = {name: self.layout.part(x, effect.site_name(name)) for name in names}
+            parameters[effect.name] = {**unit, **parts}
         return parameters
 
     def _reference_prior(self, x: Any, known: Mapping[str, tuple[Any, Any]]) -> jax.Array:

@@ -14,7 +14,7 @@ from dtprob.effects.rewriting import with_effects
 from dtprob.gap.diagnosis import Size
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.informed import informed
-from dtprob.gap.fitting.plausible import nulls, scales, sides
+from dtprob.gap.fitting.plausible import nulls, scales, sides, sizes
 from dtprob.gap.model.problem import Problem
 from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.inference.laplace import Laplace
@@ -32,19 +32,19 @@ def confirm(
     deviation of a variance effect comes from the refit, where its field is integrated out.
     """
     means = [e for e in effects if e.kind == "mean"]
-    sizes: list[Size] = []
+    found: list[Size] = []
     if means:
         posterior = _posterior(problem, fitted, means, key, engine)
         for effect in means:
             for parameter in effect.parameters:
                 draws = posterior[effect.site_name(parameter.name)]
-                sizes += _sizes(
+                found += _sizes(
                     parameter, draws.reshape(-1, *parameter.shape), prefix=_prefix(effect, effects)
                 )
     for effect in effects:
         if effect.kind == "variance":
-            sizes.append(_spread(problem, fitted, effect, prefix=_prefix(effect, effects)))
-    return tuple(sizes), all(_plausible(e, fitted, problem) for e in effects)
+            found += _spread(problem, fitted, effect, prefix=_prefix(effect, effects))
+    return tuple(found), all(_plausible(e, fitted, problem) for e in effects)
 
 
 def _posterior(
@@ -111,16 +111,25 @@ def _suffix(unit: str) -> str:
     return "" if unit == "1" else "_" + unit.replace("/", "_per_").replace("^", "").replace(" ", "_")
 
 
-def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) -> Size:
-    sd, parameter = fitted.spread[effect.name], effect.parameters[0]
-    n = sum(block.index.size for block in problem.blocks_of(effect.name))
-    half = _Z90 * sd / np.sqrt(2 * max(n, 1))
-    name = f"{prefix}{parameter.name}{_suffix(parameter.unit)}"
-    return Size(name, sd, max(sd - half, 0.0), sd + half, parameter.unit)
+def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) -> list[Size]:
+    """The standard deviation of a variance effect's field, and its places."""
+    found: list[Size] = []
+    position = {int(i): j for j, i in enumerate(fitted.global_index)}
+    for parameter in effect.parameters:
+        if parameter.is_place:
+            index = int(problem.layout[effect.site_name(parameter.name)].index[0, 0])
+            middle = float(fitted.x[index])
+            deviation, lowest = float(np.sqrt(fitted.covariance[position[index], position[index]])), -np.inf
+        else:
+            middle = fitted.spread[effect.name]
+            deviation, lowest = middle / np.sqrt(2 * max(problem.field_of(effect).index.size, 1)), 0.0
+        half, name = _Z90 * deviation, f"{prefix}{parameter.name}{_suffix(parameter.unit)}"
+        found.append(Size(name, middle, max(middle - half, lowest), middle + half, parameter.unit))
+    return found
 
 
 def _plausible(effect: Effect, fitted: fitting.Fit, problem: Problem) -> bool:
     if effect.kind == "variance":
-        return fitted.spread[effect.name] <= 4 * float(scales(effect).max())
+        return fitted.spread[effect.name] <= 4 * float(scales(effect)[sizes(effect)].max())
     index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
     return bool(np.all(np.abs(fitted.x[index] - nulls(effect)) <= 4 * scales(effect)))

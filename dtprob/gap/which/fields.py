@@ -25,14 +25,14 @@ class FieldTests(NamedTuple):
         p_value: the same, with the choice of the weighting accounted for.
         z: largest normal quantile over weightings.
         log_bayes_factor: rough, of the best weighting.
-        replicates: smallest p-value over effects and weightings of each replicate.
+        replicates: smallest p-value over weightings of each replicate.
     """
 
     smallest: Float[np.ndarray, " effect"]
     p_value: Float[np.ndarray, " effect"]
     z: Float[np.ndarray, " effect"]
     log_bayes_factor: Float[np.ndarray, " effect"]
-    replicates: Float[np.ndarray, " replicate"]
+    replicates: Float[np.ndarray, "replicate effect"]
 
 
 def field_tests(
@@ -45,8 +45,8 @@ def field_tests(
         names: the effects, in the order of the results.
         n: number of replicates.
     """
-    smallest, p_value, z, bayes, replicates = [], [], [], [], [np.ones(n)]
-    for name in names:
+    smallest, p_value, z, bayes, replicates = [], [], [], [], np.ones((n, len(names)))
+    for k, name in enumerate(names):
         observed, null = energies[name][0], energies[name][1:]
         mean, variance = null.mean(axis=0), null.var(axis=0)
         p, quantile = gamma_tail(observed, mean, variance)
@@ -55,10 +55,8 @@ def field_tests(
         p_value.append(float(family_wise(p.min()[None], null_p)[0]))
         z.append(float(quantile.max()))
         bayes.append(float(field_log_bayes_factor(observed, mean, variance).max()))
-        replicates.append(null_p)
-    return FieldTests(
-        np.array(smallest), np.array(p_value), np.array(z), np.array(bayes), np.min(replicates, axis=0)
-    )
+        replicates[:, k] = null_p
+    return FieldTests(np.array(smallest), np.array(p_value), np.array(z), np.array(bayes), replicates)
 
 
 def common_spread(

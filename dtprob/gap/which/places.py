@@ -8,7 +8,7 @@ same maximum in every replicate.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -23,13 +23,14 @@ from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.plausible import is_one_sided, nulls, places, prior_scale
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.tails import LOG_SMALLEST, any_of, effective_tests, family_wise
+from dtprob.gap.tails import LOG_SMALLEST, any_of, effective_tests, family_wise, gamma_tail
 from dtprob.gap.which.directions import surroundings
 
 _MOST_PRODUCTS: Final = 5e10
 """Products of scores that are worth looking for the places of effects; beyond, places are left out."""
-_FINER: Final = (512, 32)
-"""Places around which three times finer ones are looked at, and of these again."""
+_FINER: Final = {"mean": (512, 32), "variance": (16, 4)}
+"""Places around which three times finer ones are looked at, and of these again. Those of random fields, whose phases are
+free, change slowly from one to the next."""
 _PORTION: Final = 576
 """Places whose scores are told in one run, at most."""
 
@@ -86,7 +87,8 @@ def _best(
     grid: _Grid,
 ) -> tuple[Placed, np.ndarray]:
     """How the best place of an effect was found, and its flat parameters there."""
-    one_sided, ways = is_one_sided(effect), _ways(grid)
+    is_field, ways = effect.kind == "variance", _ways(grid)
+    one_sided = is_field or is_one_sided(effect)
     portion = min(_PORTION, len(ways) * len(grid.points))  # all looks are compiled once
 
     def told(points: np.ndarray) -> np.ndarray:
@@ -96,11 +98,12 @@ def _best(
         scores = [
             problem.programs.place_scores(effect.name, around, drawn.gradients, part) for part in padded
         ]
-        t = _standardised(np.concatenate(scores)[: len(points)])
+        all_scores = np.concatenate(scores)[: len(points)]
+        t = _quantiles(all_scores) if is_field else _standardised(all_scores)
         return t if one_sided else np.abs(t)
 
     t = told(grid.points)
-    best, highest = _finer(grid, t[:, 0], ways, lambda points: told(points)[:, 0])
+    best, highest = _finer(grid, t[:, 0], ways, lambda points: told(points)[:, 0], _FINER[effect.kind])
     largest = np.array([highest, *t[:, 1:].max(axis=0)])
     p, replicate_p = np.split(_tail(largest, len(largest) - 2, one_sided=one_sided), [1])
     # What is looked at more finely in the data alone could have been in as many more places.
@@ -116,12 +119,16 @@ def _ways(grid: _Grid) -> np.ndarray:
 
 
 def _finer(
-    grid: _Grid, scores: np.ndarray, ways: np.ndarray, told: Callable[[np.ndarray], np.ndarray]
+    grid: _Grid,
+    scores: np.ndarray,
+    ways: np.ndarray,
+    told: Callable[[np.ndarray], np.ndarray],
+    counts: Sequence[int],
 ) -> tuple[np.ndarray, float]:
     """The best place and its score, after finer and finer looks around those with the largest scores of the grid."""
     (points, spacing), highest = grid, float(scores.max())
     best = points[int(scores.argmax())]
-    for kept in _FINER:
+    for kept in counts:
         chosen = np.argsort(-scores)[:kept]
         spacing = spacing[chosen] / 3
         points = (points[chosen][:, None] + ways * spacing[:, None]).reshape(-1, points.shape[1])
@@ -150,6 +157,16 @@ def _standardised(scores: Float[np.ndarray, "place n"]) -> Float[np.ndarray, "pl
     variance = np.concatenate([total / count, (total - square) / (count - 1)], axis=1)
     seen = variance > 1e-12 * variance.max(initial=1e-300)
     return np.where(seen, scores, 0.0) / np.sqrt(np.where(seen, variance, 1.0))
+
+
+def _quantiles(energies: Float[np.ndarray, "place n"]) -> Float[np.ndarray, "place n"]:
+    """Normal quantiles of the energies of a random field, each beside the replicates but itself."""
+    null, count = energies[:, 1:], energies.shape[1] - 1
+    total, square = null.sum(axis=1, keepdims=True), (null**2).sum(axis=1, keepdims=True)
+    n = np.array([count, *[count - 1] * count])
+    own = np.concatenate([np.zeros_like(total), null], axis=1)
+    mean = (total - own) / n
+    return gamma_tail(energies, mean, (square - own**2) / n - mean**2)[1]
 
 
 def _tail(t: Float[np.ndarray, " n"], freedom: int, *, one_sided: bool) -> Float[np.ndarray, " n"]:

@@ -97,7 +97,7 @@ def screen(
     around = surroundings(problem, fitted.x)
     told = mean_scores(problem, projection, drawn, tangents(around, means, problem.programs))
     scores = replace(told, price=np.array([placed[e.name].price if e.name in placed else 0.0 for e in means]))
-    energy = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
+    energy = problem.programs.field_energy(around.grown(), drawn.gradients, fields) if fields else {}
     tested = field_tests(energy, [e.name for e in fields], drawn.at_sites)
     (mean_p, mean_z), null_p = _mean_tests(scores, scores.u[None]), _mean_tests(scores, scores.u_null)[0]
     for k, found in ((k, placed[e.name]) for k, e in enumerate(means) if e.name in placed):
@@ -105,10 +105,14 @@ def screen(
         one_sided = is_one_sided(means[k])
         z = deviation(found.p_value, one_sided=one_sided)
         mean_z[0, k] = z if one_sided else np.copysign(z, mean_z[0, k])
+    for k, found in ((k, placed[e.name]) for k, e in enumerate(fields) if e.name in placed):
+        tested.smallest[k] = tested.p_value[k] = found.p_value
+        tested.replicates[:, k], tested.z[k] = 1.0, deviation(found.p_value, one_sided=True)
+        tested.log_bayes_factor[k] -= found.price
     replicate_p = null_p.min(axis=1, initial=1.0)
     # The replicates of fields and of places are the first of the same data sets.
     for others in (
-        *([tested.replicates] if fields else []),
+        *([tested.replicates.min(axis=1)] if fields else []),
         *(found.replicate_p for found in placed.values()),
     ):
         replicate_p = np.minimum(replicate_p[: len(others)], others)

@@ -64,9 +64,10 @@ class Search:
 def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say) -> Search:
     """Look for the effects that are missing, one after another; of several ways the one whose end has most credit stands.
 
-    Where a random field was accepted, which can imitate several effects at once, the search goes on without it too. A field
-    alone that one family of a site beats is taken back: it stands in for an effect that is not known. Where a pair promises
-    as much as was reached, the search is started from that pair.
+    Where a random field was accepted, which can imitate several effects at once, the search goes on without it too, but not
+    without one whose place was found, which can imitate little. A field alone that one family of a site beats is taken
+    back: it stands in for an effect that is not known. Where a pair promises as much as was reached, the search starts from
+    that pair.
 
     Args:
         problem: the model and candidates on their data.
@@ -78,9 +79,9 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     steps = _forward(problem, base, key, settings, say)
     end, base = steps[-1].view, steps[0].view.fitted
     ways = [steps]
-    kinds = {e.name: e.kind for e in problem.effects}
-    field = next((name for name in end.fitted.effects if kinds[name] == "variance"), None)
-    if field is not None:
+    fields = {e.name: e for e in problem.effects if e.kind == "variance"}
+    field = next((name for name in end.fitted.effects if name in fields), None)
+    if field is not None and not fields[field].is_looked_for:
         say(f"looking for effects that {field} may have imitated")
         rest = _refitted_without(end.problem, end.fitted, field)
         key = jax.random.fold_in(key, 1)

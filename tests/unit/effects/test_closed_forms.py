@@ -384,6 +384,35 @@ def test_extra_path_is_a_radar_echo(world, apply):
     assert np.allclose(slope, -2 * np.pi * 2e6 * ((first + second) / SPEED)[:, None])
 
 
+def test_an_echo_off_any_point_differs_by_the_gain_of_each_link(world):
+    paths, context = world.data["paths"], {**world.data, **SHARED}
+    of_floor, anywhere = (
+        catalogue(world.sites, world.data, [f"extra_path[{n}]"])[0] for n in ("floor", "anywhere")
+    )
+    value = jnp.zeros((3, 1, 4, 3, 17), complex)
+    field = np.random.default_rng(0).normal(size=anywhere.shape_of_field(value, context))
+    on_floor = np.asarray(paths.mask)[..., None] & (np.asarray(paths.object) == 2)
+    point = np.asarray(paths.vertex)[on_floor & (np.asarray(paths.interaction) == SPECULAR)].mean(axis=0)
+    given = {"scale": jnp.asarray(0.5), "field": jnp.asarray(field), **dict(zip("xyz", point, strict=True))}
+    added = anywhere.rewrites["noiseless_channel"](value, given, context)
+    fixed = of_floor.rewrites["noiseless_channel"](value, {"scattering": jnp.asarray([1.0, 0.0])}, context)
+    ratio = np.asarray(added / fixed)
+    gain = 0.5 * np.abs(field[..., 0] + 1j * field[..., 1]) / np.sqrt(2)
+    np.testing.assert_allclose(np.abs(ratio), np.broadcast_to(gain, ratio.shape), rtol=1e-6)
+    np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1, :1, :1, :1], ratio.shape), rtol=1e-6)
+
+
+def test_places_off_which_an_echo_is_looked_for_cover_the_links(world):
+    effect = catalogue(world.sites, world.data, ["extra_path[anywhere]"])[0]
+    paths = world.data["paths"]
+    ends = np.concatenate([np.asarray(paths.tx_position), np.asarray(paths.rx_position)])
+    step = SPEED / 2 / np.ptp(np.asarray(world.data["subcarrier_frequency"]))
+    for i, parameter in enumerate(effect.fitted):
+        assert parameter.tried[0] <= ends[:, i].min()
+        assert parameter.tried[-1] > ends[:, i].max() - step
+    assert effect.is_looked_for
+
+
 def test_diffraction_reaches_obstructed_links_only(world):
     effect = catalogue(world.sites, world.data, ["diffraction"])[0]
     value = jnp.zeros((3, 1, 4, 3, 17), complex)

@@ -200,6 +200,23 @@ def bump(prior=None):
     return Effect("bump", {"mean": rewrite}, (Parameter("c", prior), at))
 
 
+def gusty():
+    """Moves the mean around some x, that the data tell, by a random height for each link."""
+
+    def rewrite(value, p, context):
+        near = jnp.exp(-0.5 * ((context["x"] - p["at"]) / WIDTH) ** 2)
+        return value + p["height"] * p["field"] * near
+
+    at = Parameter("at", dist.Normal(0.0, 1.2), is_place=True, tried=PLACES)
+    return Effect(
+        "gusty",
+        {"mean": rewrite},
+        (Parameter("height", dist.HalfNormal(2.0, validate_args=False)), at),
+        kind="variance",
+        field_shape=lambda value, _: (value.shape[0], *(1,) * (value.ndim - 1)),
+    )
+
+
 def raised(x, at, size):
     """What a bump adds."""
     return size * np.exp(-0.5 * ((x - at) / WIDTH) ** 2)

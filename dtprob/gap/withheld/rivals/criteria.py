@@ -49,7 +49,7 @@ def bic(problem: Problem, fitted: Fit) -> Float[np.ndarray, " 1"]:
     """
     chosen = [e for e in problem.live if e.name in fitted.effects]
     fields = tuple(e.name for e in chosen if e.kind == "variance")
-    size = len(fields) + sum(e.dimension for e in chosen if e.kind == "mean")
+    size = sum(e.dimension for e in chosen)
     held = fitting.fit(problem, fitted.x, fields, spread=fitted.spread, steps=0)
     return np.array([held.log_evidence - 0.5 * size * np.log(problem.n_observation)])
 

@@ -36,7 +36,7 @@ class Look:
         scores: of these effects, adjusted for the nuisances.
         u: the same scores, (1 + replicate, column).
         unadjusted: information (column, column) as if the nuisances were known.
-        energy: of each random field, (field, 1 + replicate, weighting).
+        field_log_p: log p-value of each random field by its energy, (1 + replicate, field).
         gain: nats that each candidate brings at its best size, (1 + replicate, effect).
         size: number of parameters of each candidate that the data can see.
     """
@@ -50,7 +50,7 @@ class Look:
     scores: Scores
     u: Float[np.ndarray, "n column"]
     unadjusted: Float[np.ndarray, "column column"]
-    energy: Float[np.ndarray, "field n weighting"]
+    field_log_p: Float[np.ndarray, "n field"]
     gain: Float[np.ndarray, "n effect"]
     size: Float[np.ndarray, " effect"]
 
@@ -58,11 +58,6 @@ class Look:
     def names(self) -> tuple[str, ...]:
         """Of the candidates."""
         return tuple(effect.name for effect in self.effects)
-
-    def field_log_p(self) -> Float[np.ndarray, "n field"]:
-        """Log p-value of each random field by its energy, the smallest over weightings."""
-        found = [np.log(gamma_tail(e, e[1:].mean(0), e[1:].var(0))[0]).min(axis=1) for e in self.energy]
-        return np.stack(found, axis=1) if found else np.zeros((len(self.u), 0))
 
 
 def look(problem: Problem, fitted: Fit, key: jax.Array, settings: Settings) -> Look:
@@ -86,10 +81,11 @@ def look(problem: Problem, fitted: Fit, key: jax.Array, settings: Settings) -> L
     found = tangents(around, means, problem.programs)
     scores = mean_scores(problem, projection, drawn, found)
     u = _paid(scores, np.concatenate([scores.u[None], scores.u_null]), placed)
-    energies = problem.programs.field_energy(around.grown(), drawn.gradients) if fields else {}
-    energy = np.array([energies[e.name] for e in fields]) if fields else np.zeros((0, len(u), 1))
+    energies = problem.programs.field_energy(around.grown(), drawn.gradients, fields) if fields else {}
+    log_p = [_field_log_p(energies[e.name], placed.get(e.name)) for e in fields]
     square, size = _mean_gains(scores, u)
-    gain = np.concatenate([square, *(_field_gain(e)[:, None] for e in energy)], axis=1)
+    told = [_field_gain(energies[e.name], placed.get(e.name)) for e in fields]
+    gain = np.concatenate([square, *(one[:, None] for one in told)], axis=1)
     return Look(
         problem=problem,
         fitted=fitted,
@@ -100,7 +96,7 @@ def look(problem: Problem, fitted: Fit, key: jax.Array, settings: Settings) -> L
         scores=scores,
         u=u,
         unadjusted=_unadjusted(scores, found.columns),
-        energy=energy,
+        field_log_p=np.stack(log_p, axis=1) if log_p else np.zeros((len(u), 0)),
         gain=gain,
         size=np.concatenate([size, np.ones(len(fields))]),
     )
@@ -135,12 +131,23 @@ def _mean_gains(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return gain, size
 
 
-def _field_gain(energy: np.ndarray) -> np.ndarray:
+def _field_log_p(energy: Float[np.ndarray, "n weighting"], placed: Placed | None) -> Float[np.ndarray, " n"]:
+    """Log p-value of a random field by its energy, the smallest over weightings; the choice of a place is paid for."""
+    if placed is not None:
+        return np.log(np.array([placed.p_value, *placed.replicate_p]))
+    return np.log(gamma_tail(energy, energy[1:].mean(0), energy[1:].var(0))[0]).min(axis=1)
+
+
+def _field_gain(energy: Float[np.ndarray, "n weighting"], placed: Placed | None) -> Float[np.ndarray, " n"]:
     """Nats of a random field's best spread, for entries of equal information: nu / 2 (r - 1 - log r).
 
     Args:
-        energy: of the data and of replicates (1 + replicate, weighting).
+        energy: of the data and of replicates.
+        placed: how the place was found, of an effect that may act anywhere: the choice is paid for.
     """
+    if placed is not None:
+        p = np.array([placed.p_value, *placed.replicate_p])
+        return 0.5 * np.maximum(deviation(p, one_sided=True), 0.0) ** 2
     mean, variance = energy[1:].mean(axis=0), energy[1:].var(axis=0)
     safe = np.maximum(mean, _NOTHING)
     nu = 2 * safe**2 / np.maximum(variance, 1e-12 * safe**2)

@@ -23,7 +23,7 @@ def unadjusted(seen: Look) -> Claim:
     """
     columns = [_log_p(seen, k) for k in range(len(seen.scores.effects))]
     own = np.stack(columns, axis=1) if columns else np.zeros((len(seen.u), 0))
-    log_p = np.concatenate([own, seen.field_log_p()], axis=1)
+    log_p = np.concatenate([own, seen.field_log_p], axis=1)
     ranking = tuple(seen.names[i] for i in np.argsort(log_p[0], kind="stable"))
     return Claim(chance(-log_p.min(axis=1)), ranking[:1], ranking)
 

@@ -107,7 +107,8 @@ def test_field_energy_is_the_sum_of_squared_link_scores(case):
     name, problem, x = case
     rows = jnp.asarray(np.random.default_rng(6).normal(size=(3, *problem.rows.gather.shape)))
     gradients = problem.compiled.site_gradient(x, rows)
-    energy = problem.programs.field_energy(surroundings(problem, x).grown(), gradients)["jitter"][:, 0]
+    around = surroundings(problem, x).grown()
+    energy = problem.programs.field_energy(around, gradients, problem.effects)["jitter"][:, 0]
     scores = np.asarray(gradients["mean"]).reshape(3, len(draw(name)["x"]), -1).sum(-1)
     np.testing.assert_allclose(energy, (scores**2).sum(-1), rtol=1e-8, atol=1e-20)
 

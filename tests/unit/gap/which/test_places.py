@@ -16,11 +16,13 @@ from dtprob.gap.fitting.projection import project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import view
+from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.directions import surroundings
 from dtprob.gap.which.places import place
 from dtprob.gap.which.screen import screen
 from dtprob.gap.which.trials import tried
-from tests.unit.gap.examples import PLACES, WIDTH, bump, draw, inputs, line, raised, ripple
+from dtprob.inference.laplace import Laplace
+from tests.unit.gap.examples import PLACES, WIDTH, bump, draw, gusty, inputs, line, raised, ripple
 
 FAST = replace(Settings(), replicates=99)
 
@@ -89,6 +91,52 @@ def test_an_effect_of_one_side_is_looked_for_on_that_side(looked):
     assert place(above, base, drawn)[1]["bump"].p_value < 1e-4
 
 
+def test_energies_at_places_are_those_of_the_field_there(looked):
+    problem, base, _, drawn = looked(of=Problem(line, draw("line"), [gusty()]))
+    around = surroundings(problem, base.x).grown()
+    told = problem.programs.place_scores(
+        "gusty", around, drawn.gradients, np.array([[0.0, -0.7], [0.0, 1.1]])
+    )
+    for at, energies in zip((-0.7, 1.1), told, strict=True):
+        size, place_of = gusty().parameters
+        there = replace(gusty(), parameters=(size, replace(place_of, null=at)))
+        expected = problem.programs.field_energy(around, drawn.gradients, [there])["gusty"][:, 0]
+        np.testing.assert_allclose(energies, expected, rtol=1e-4)
+
+
+def test_a_random_field_is_found_and_fitted_at_its_place(looked):
+    """Heights of each link around one x: the place, their spread and both in the confirmed sizes."""
+    heights = 1.5 * np.random.default_rng(5).normal(size=(len(inputs()), 1))
+    problem, base, _, drawn = looked(
+        heights * raised(inputs(), 0.4, 1.0), of=Problem(line, draw("line"), [gusty(), ripple()])
+    )
+    found = place(problem, base, drawn)[1]
+    assert found["gusty"].p_value < 1e-4
+    seen = view(problem, base, jax.random.key(2), FAST)
+    assert seen.screening.names[int(seen.screening.log_bayes_factor.argmax())] == "gusty"
+    trials = tried(seen, FAST, lambda _: None)
+    fitted, end = trials.fits["gusty"], trials.problem
+    at = end.layout["gusty.at"].offset
+    assert abs(fitted.x[at] - 0.4) < 0.2 * WIDTH
+    assert abs(fitted.spread["gusty"] - heights.std()) < 4 * heights.std() / np.sqrt(2 * len(heights))
+    assert fitted.log_evidence > base.log_evidence + 10
+    effect = next(e for e in end.effects if e.name == "gusty")
+    sizes = {s.name: s for s in confirm(end, fitted, [effect], jax.random.key(0), Laplace())[0]}
+    assert set(sizes) == {"height", "at"}
+    assert sizes["height"].low < heights.std() < sizes["height"].high
+    assert sizes["at"].low < fitted.x[at] < sizes["at"].high
+
+
+def test_a_random_field_is_not_found_where_there_is_none(looked):
+    """The smallest of 40 p-values at the best place is no smaller than chance lets it be, one time in a thousand."""
+    of = Problem(line, draw("line"), [gusty()])
+    values = []
+    for seed in range(1, 41):
+        problem, base, _, drawn = looked(seed=seed, of=of)
+        values.append(place(problem, base, drawn)[1]["gusty"].p_value)
+    assert (np.array(values) < 0.05).sum() <= stats.binom.isf(1e-3, len(values), 0.05)
+
+
 def test_an_effect_that_is_fitted_stays_where_it_is(looked):
     problem, base, _, drawn = looked(raised(inputs(), 0.4, 1.5))
     same, found = place(problem, replace(base, effects=("bump",)), drawn)
@@ -146,8 +194,28 @@ def test_what_is_not_there_has_a_negative_score(looked):
             ),
             "one size",
         ),
+        (
+            lambda tried: (
+                Parameter("c", dist.Normal()),
+                Parameter("d", dist.Normal()),
+                Parameter("at", dist.Normal(), is_place=True, tried=tried),
+            ),
+            "one size",
+        ),
     ],
 )
 def test_what_cannot_be_looked_for_is_refused(parameters, message):
     with pytest.raises(InputError, match=message):
         Effect("odd", {"mean": lambda value, p, _: value + p["c"]}, parameters((0.0, 1.0)))
+
+
+@pytest.mark.parametrize(("sites", "tried"), [(("mean", "other"), (0.0, 1.0)), (("mean",), ())])
+def test_a_random_field_acts_at_one_site_where_it_is_looked_for(sites, tried):
+    at = Parameter("at", dist.Normal(), is_place=True, tried=tried)
+    with pytest.raises(InputError, match="tried values of each place and then one site"):
+        Effect(
+            "odd",
+            dict.fromkeys(sites, lambda value, p, _: value + p["field"]),
+            (Parameter("c", dist.HalfNormal()), at),
+            kind="variance",
+        )
