@@ -62,12 +62,10 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     first, starts, step = fit(problem, centre), [centre], _STEPS[0] * scale
     if not _runs_away(problem, first, centre, scale):
         joint = fit_base(problem, key, polished=polished)
-        near = np.minimum(step, _STEPS[1] * np.sqrt(np.diag(joint.covariance)))
-        up, down = _beside(problem, joint.x, near)
-        slope = (up - down).sum(axis=0) / (2 * near)
-        if slope @ joint.covariance @ slope < _MATTERS:
-            return Start(problem, joint)
-        starts.append(joint.x)
+        if not _runs_away(problem, joint, centre, scale):
+            if _is_near_the_marginal_one(problem, joint, step):
+                return Start(problem, joint)
+            starts.append(joint.x)
     say("integrating out what each cluster has of its own")
     here, height = max((_height(problem, x) for x in starts), key=lambda found: found[1])
     here, height, volume = _about_the_mode(problem, here, height, scale)
@@ -76,6 +74,14 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     if _height(problem, found.x)[1] < height - _ARRIVED:
         found = fit(whole, here, steps=0)
     return Start(whole, found)
+
+
+def _is_near_the_marginal_one(problem: Problem, joint: Fit, step: np.ndarray) -> bool:
+    """Whether a joint mode is no farther from the marginal one than what the data tell apart."""
+    near = np.minimum(step, _STEPS[1] * np.sqrt(np.diag(joint.covariance)))
+    up, down = _beside(problem, joint.x, near)
+    slope = (up - down).sum(axis=0) / (2 * near)
+    return bool(slope @ joint.covariance @ slope < _MATTERS)
 
 
 def _runs_away(problem: Problem, first: Fit, centre: np.ndarray, scale: np.ndarray) -> bool:

@@ -12,6 +12,7 @@ import numpy as np
 from numpyro.distributions import biject_to, constraints
 from numpyro.distributions.transforms import IdentityTransform
 
+from dtprob.gap.model.own import Own
 from dtprob.models.declaration import base_constraint
 
 
@@ -80,22 +81,16 @@ class Layout:
                 x[block.index] = values[other.index]
 
 
-def make_layout(
-    entries: Iterable[tuple[str, str | None, tuple[int, ...], tuple[str, ...]]],
-    cluster: str | None,
-    n_cluster: int,
-) -> Layout:
-    """Lay out (name, owner, shape, axes) entries one after another."""
+def make_layout(entries: Iterable[tuple[str, str | None, tuple[int, ...]]], own: Mapping[str, Own]) -> Layout:
+    """Lay out (name, owner, shape) entries one after another; `own` tells which have entries for each cluster."""
     blocks: list[Block] = []
     offset = 0
-    for name, owner, shape, axes in entries:
+    for name, owner, shape in entries:
         size = int(np.prod(shape, dtype=int))
         index = offset + np.arange(size).reshape(shape)
-        axis = axes.index(cluster) if cluster in axes[: len(shape)] else None
-        local = axis is not None and shape[axis] == n_cluster
-        if local and axis is not None:
-            index = np.moveaxis(index, axis, 0)
-        blocks.append(Block(name, owner, shape, index.reshape(n_cluster if local else 1, -1), local))
+        local = name in own
+        arranged = own[name].arranged(index) if local else index.reshape(1, -1)
+        blocks.append(Block(name, owner, shape, arranged, local))
         offset += size
     return Layout(tuple(blocks), offset)
 

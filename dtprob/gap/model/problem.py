@@ -19,8 +19,10 @@ import numpy as np
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.errors import InputError
 from dtprob.gap.model.compiled import Compiled
+from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import Block, Layout, make_layout, normal_of, transform_of
+from dtprob.gap.model.own import Own, along_axis, along_column
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.model.rows import Rows, make_rows
@@ -59,20 +61,35 @@ class Problem:
         cluster: str | None = None,
         reference: Sampler | None = None,
     ) -> None:
-        self.model, self.data, self.effects = model, dict(data), tuple(effects)
-        column = cluster if cluster is not None and cluster in data and np.ndim(data[cluster]) == 1 else None
-        self.declaration: Declaration = declare(model, data, cluster=None if column else cluster)
+        self.data, self.effects = dict(data), tuple(effects)
         self.arrays, static = split_static(data)
-        self._declared = Declared(model, self.declaration, static)
+        self._column = (
+            cluster if cluster is not None and cluster in data and np.ndim(data[cluster]) == 1 else None
+        )
+        self._cluster = None if self._column else cluster
+        self._declare(model, static)
         self._check_effects()
-        self._column = column
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self.per_cluster: frozenset[str] = frozenset()
         self.volume: Volume | None = None
+        self.own: dict[str, Own] = {}
         self.set_live(())
+        self.own = self._found_own()
+        self.set_live(())
+        shared = self.declaration.latent.keys() - self.own.keys()
+        drawn = model if reference is not None else decentred(model, data, shared)
+        if drawn is not model:
+            self._declare(drawn, static)
+            self.set_live(())
+        self.own |= self._found_own_fields()
         if reference is not None:
             self.known = normal_of(self._reference_draws(reference))
             self.set_live(())
+
+    def _declare(self, model: Model, static: Any) -> None:
+        self.model = model
+        self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
+        self._declared = Declared(model, self.declaration, static)
 
     def set_live(self, live: tuple[Effect, ...]) -> None:
         """Index rows and coordinates for a set of live effects; nothing is compiled yet."""
@@ -92,6 +109,7 @@ class Problem:
             self.rows,
             shapes,
             families,
+            self.own,
             frozenset(self.known),
         )
 
@@ -243,18 +261,55 @@ class Problem:
 
     def _make_layout(self) -> Layout:
         shapes = latent_shapes(self._declared, self.arrays)
-        entries: list[tuple[str, str | None, tuple[int, ...], tuple[str, ...]]] = []
-        for name, site in self.declaration.latent.items():
-            axes = site.axes if len(site.axes) == len(shapes[name]) else ()
-            entries.append((name, None, shapes[name], axes))
+        entries: list[tuple[str, str | None, tuple[int, ...]]] = [
+            (name, None, shapes[name]) for name in self.declaration.latent
+        ]
+        own, count = dict(self.own), self.n_cluster
         for effect in self.live:
             if effect.kind == "variance":
-                own = (str(self.declaration.cluster),)
-                of_site = self.declaration.sites[effect.sites[0]].axes
-                axes = own if effect.name in self.per_cluster else of_site
-                entries.append((effect.site_name(FIELD), effect.name, self.field_shapes[effect.name], axes))
-            entries += [(effect.site_name(p.name), effect.name, p.shape, ()) for p in effect.fitted]
-        return make_layout(entries, str(self.declaration.cluster), self.rows.n_cluster)
+                name, shape = effect.site_name(FIELD), self.field_shapes[effect.name]
+                entries.append((name, effect.name, shape))
+                axis = self._axis_of_clusters(effect)
+                if name not in own and axis is not None and axis < len(shape) and shape[axis] == count:
+                    own[name] = Own(axis, np.arange(count))
+            entries += [(effect.site_name(p.name), effect.name, p.shape) for p in effect.fitted]
+        return make_layout(entries, own)
+
+    def _axis_of_clusters(self, effect: Effect) -> int | None:
+        """Along which axis of its field a variance effect has entries for each cluster."""
+        if effect.name in self.per_cluster:
+            return 0
+        axes, cluster = self.declaration.sites[effect.sites[0]].axes, self.declaration.cluster
+        return axes.index(cluster) if self._column is None and cluster in axes else None
+
+    def _found_own(self) -> dict[str, Own]:
+        """Which latent sites have entries for each cluster; none counts as having any before."""
+        if self._column is None:
+            shapes = latent_shapes(self._declared, self.arrays)
+            return along_axis(self.declaration, shapes, self.n_cluster)
+        return self._along_column({b.name: b for b in self.blocks_of(None)}, self)
+
+    def _found_own_fields(self) -> dict[str, Own]:
+        """The same of the fields of variance effects, where a column makes the clusters."""
+        found: dict[str, Own] = {}
+        for name in {} if self._column is None else self.field_shapes:
+            with_it = self.with_live([name])
+            block = with_it.field_of(with_it.live[0])
+            found |= self._along_column({block.name: block}, with_it)
+        return found
+
+    def _along_column(self, blocks: Mapping[str, Block], of: Problem) -> dict[str, Own]:
+        """Which of a problem's blocks have entries for each cluster, found by moving them."""
+        wide = {n: b.index.reshape(b.shape) for n, b in blocks.items() if self.n_cluster in b.shape}
+        if not wide:
+            return {}
+
+        def told(x: np.ndarray) -> tuple[np.ndarray, float]:
+            likelihood, prior, _ = of.compiled.evaluate(x)
+            return likelihood, float(prior)
+
+        column = np.asarray(self.data[str(self._column)])
+        return along_column(wide, column, of.prior_draws(jax.random.key(0), 1)[0], told)
 
     # -- points ---------------------------------------------------------------------------------------------------
 

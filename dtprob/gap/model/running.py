@@ -16,6 +16,7 @@ from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.rewriting import Rewriting
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import Layout, fold, transform_of
+from dtprob.gap.model.own import Own
 from dtprob.gap.model.rows import Rows
 from dtprob.gap.observation import whiten
 from dtprob.models.declaration import Declaration
@@ -80,6 +81,7 @@ class Runner:
         rows: the whitened rows of the observations.
         shapes: (component, *site shape) of each observed site's rows.
         families: the distribution family of each observed site.
+        own: which latent sites have entries for each cluster.
         known: nuisances that earlier data inform instead of the prior.
     """
 
@@ -89,6 +91,7 @@ class Runner:
     rows: Rows
     shapes: Mapping[str, tuple[int, ...]]
     families: Mapping[str, str]
+    own: Mapping[str, Own]
     known: frozenset[str]
 
     @cached_property
@@ -124,9 +127,8 @@ class Runner:
                 continue
             fn = trace[name]["fn"]
             density = fn.log_prob(trace[name]["value"]) + fold(jacobians[name], fn.batch_shape)
-            if self.layout[name].local:
-                axis = declaration.sites[name].axes.index(str(declaration.cluster))
-                local = local + jnp.moveaxis(density, axis, 0).reshape(self.rows.n_cluster, -1).sum(1)
+            if name in self.own:
+                local = local + self.own[name].summed(density)
             else:
                 total = total + jnp.sum(density)
         names = [*declaration.latent, *declaration.deterministic]

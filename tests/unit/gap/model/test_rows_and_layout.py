@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from dtprob.errors import InputError
 from dtprob.gap.model.layout import make_layout
+from dtprob.gap.model.own import Own
 from dtprob.gap.model.rows import make_rows
 from dtprob.models.declaration import declare
 
@@ -83,26 +84,27 @@ def test_an_unknown_cluster_axis_is_refused():
 def test_local_blocks_have_one_row_per_cluster():
     layout = make_layout(
         [
-            ("scale", None, (), ()),
-            ("level", None, (3, 2), ("link", "tap")),
-            ("turn", None, (2, 3), ("tap", "link")),
-            ("bias", "offset", (2,), ("tap",)),
+            ("scale", None, ()),
+            ("level", None, (3, 2)),
+            ("turn", None, (2, 3)),
+            ("mixed", None, (3,)),
+            ("bias", "offset", (2,)),
         ],
-        "link",
-        3,
+        {"level": Own(0, np.arange(3)), "turn": Own(1, np.arange(3)), "mixed": Own(0, np.array([2, 0, 1]))},
     )
-    assert layout.dimension == 15
-    assert [b.local for b in layout.blocks] == [False, True, True, False]
+    assert layout.dimension == 18
+    assert [b.local for b in layout.blocks] == [False, True, True, True, False]
     np.testing.assert_array_equal(layout["level"].index, [[1, 2], [3, 4], [5, 6]])
     np.testing.assert_array_equal(layout["turn"].index, [[7, 10], [8, 11], [9, 12]])
-    np.testing.assert_array_equal(layout["bias"].index, [[13, 14]])
+    np.testing.assert_array_equal(layout["mixed"].index, [[15], [13], [14]])
+    np.testing.assert_array_equal(layout["bias"].index, [[16, 17]])
 
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(st.lists(st.integers(1, 3), max_size=3), min_size=1, max_size=4))
 def test_parts_come_back_as_they_were_put(shapes):
-    entries = [(f"s{i}", None, tuple(s), tuple(f"a{j}" for j in range(len(s)))) for i, s in enumerate(shapes)]
-    layout, x = make_layout(entries, None, 1), np.zeros(sum(int(np.prod(s)) for s in shapes))
+    entries = [(f"s{i}", None, tuple(s)) for i, s in enumerate(shapes)]
+    layout, x = make_layout(entries, {}), np.zeros(sum(int(np.prod(s)) for s in shapes))
     values = {e[0]: np.random.default_rng(i).normal(size=e[2]) for i, e in enumerate(entries)}
     for name, value in values.items():
         layout.put(x, name, value)
@@ -111,8 +113,9 @@ def test_parts_come_back_as_they_were_put(shapes):
 
 
 def test_shared_blocks_move_between_layouts():
-    old = make_layout([("a", None, (2,), ()), ("b", None, (3,), ("link",))], "link", 3)
-    new = make_layout([("b", None, (3,), ("link",)), ("new", "e", (), ()), ("a", None, (2,), ())], "link", 3)
+    own = {"b": Own(0, np.arange(3))}
+    old = make_layout([("a", None, (2,)), ("b", None, (3,))], own)
+    new = make_layout([("b", None, (3,)), ("new", "e", ()), ("a", None, (2,))], own)
     x = np.full(6, -1.0)
     new.copy_into(x, old, np.arange(5.0))
     np.testing.assert_array_equal(x, [2, 3, 4, -1, 0, 1])

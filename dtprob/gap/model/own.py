@@ -1,0 +1,113 @@
+"""Which unknowns of a model have an entry for each cluster, so that a fit can find and integrate them cluster by cluster.
+
+Where an axis of the model makes the clusters, its name tells. Where a column of the data does, as in `level[site]` with
+clusters by `site`, the model is asked: an entry belongs to a cluster if nothing else depends on it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from typing import Final, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from dtprob.models.declaration import Declaration
+
+_SPLITS: Final = 8
+"""Halves of the clusters whose entries are moved: two clusters lie in one half of all with probability 2^-8."""
+_EXACT: Final = 1e3
+"""Change of a log density that is rounding, in the precision of its numbers."""
+
+type LogDensities = Callable[[np.ndarray], tuple[np.ndarray, float]]
+"""Flat vector -> log likelihood of each cluster, log prior of all that is shared."""
+
+
+class Own(NamedTuple):
+    """Along which axis of an unknown the clusters lie, and at which of its positions each one."""
+
+    axis: int
+    position: Int[np.ndarray, " cluster"]
+
+    def arranged(self, index: Int[np.ndarray, "*shape"]) -> Int[np.ndarray, "cluster size"]:
+        """Entries in the shape of the unknown, cluster by cluster."""
+        first = np.moveaxis(index, self.axis, 0)[self.position]
+        return first.reshape(len(self.position), -1)
+
+    def summed(self, density: jax.Array) -> jax.Array:
+        """Log density (*site) summed to (cluster,)."""
+        first = jnp.moveaxis(density, self.axis, 0)[self.position]
+        return first.reshape(len(self.position), -1).sum(1)
+
+
+def along_axis(
+    declaration: Declaration, shapes: Mapping[str, tuple[int, ...]], n_cluster: int
+) -> dict[str, Own]:
+    """Unknowns with the axis of the clusters, by the unconstrained shape of each."""
+    axes = {n: site.axes for n, site in declaration.latent.items() if len(site.axes) == len(shapes[n])}
+    found = {n: names.index(declaration.cluster) for n, names in axes.items() if declaration.cluster in names}
+    return {n: Own(i, np.arange(n_cluster)) for n, i in found.items() if shapes[n][i] == n_cluster}
+
+
+def along_column(
+    unknowns: Mapping[str, Int[np.ndarray, "*shape"]],
+    column: np.ndarray,
+    x: Float[np.ndarray, " dimension"],
+    told: LogDensities,
+) -> dict[str, Own]:
+    """Unknowns each of whose entries acts in one cluster: in that of its number in a column, or in the order of rows.
+
+    Args:
+        unknowns: positions in the flat vector, in the shape of each.
+        column: whose values make the clusters.
+        x: a point with finite densities.
+        told: the model's densities.
+    """
+    distinct = np.unique(column)
+    count = len(distinct)
+    values = column if count == len(column) else distinct
+    orders = [np.arange(count)]
+    if np.issubdtype(values.dtype, np.number) and np.array_equal(np.sort(values), np.arange(count)):
+        orders.insert(0, values.astype(int))
+    found: dict[str, Own] = {}
+    for name, index in unknowns.items():
+        axes = [i for i, n in enumerate(index.shape) if n == count]
+        tries = (Own(axis, order) for axis in axes for order in orders)
+        own = next((one for one in tries if _belong(one.arranged(index), x, told)), None)
+        if own is not None:
+            found[name] = own
+    return found
+
+
+def _belong(index: Int[np.ndarray, "cluster size"], x: np.ndarray, told: LogDensities) -> bool:
+    """Whether moving the entries of some clusters leaves the others' likelihood alone, and the prior falls apart."""
+    rng = np.random.default_rng(0)
+    step = 0.1 * rng.standard_normal(index.shape)
+    before, prior = told(x)
+    rounding = _EXACT * np.finfo(before.dtype).eps
+    moves_any = False
+    for moved in _halves(len(index), rng):
+        likelihood, priors = zip(
+            *(told(_moved(x, index, step, part)) for part in (moved, ~moved)), strict=True
+        )
+        both = told(_moved(x, index, step, np.ones_like(moved)))[1]
+        change = np.abs(np.where(moved, likelihood[1], likelihood[0]) - before)
+        apart = abs(priors[0] + priors[1] - both - prior)
+        alone = bool((change <= rounding * np.maximum(np.abs(before), 1.0)).all())
+        if not alone or not apart <= rounding * max(abs(prior), 1.0):
+            return False
+        moves_any |= bool((np.where(moved, likelihood[0], likelihood[1]) != before).any())
+    return moves_any
+
+
+def _halves(count: int, rng: np.random.Generator) -> Iterator[np.ndarray]:
+    for _ in range(_SPLITS):
+        yield rng.permutation(np.arange(count) < count // 2)
+
+
+def _moved(x: np.ndarray, index: np.ndarray, step: np.ndarray, part: np.ndarray) -> np.ndarray:
+    x = x.copy()
+    x[index[part]] += step[part]
+    return x

@@ -1,0 +1,129 @@
+"""Levels of groups: which clusters they belong to, and models in which several clusters share them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.fitting.integrated import based
+from dtprob.gap.model.decentred import decentred
+from dtprob.gap.model.problem import Problem
+from dtprob.inference.laplace import Laplace
+
+N_SITE, N_ROW = 20, 300
+SPREAD = 2.0
+
+
+def sensors(x, site, day, y=None, *, n_site=N_SITE):
+    """Levels of sites around an unknown mean with an unknown spread, and a slope that all share."""
+    mean = numpyro.sample("mean", dist.Normal(0.0, 10.0))
+    spread = numpyro.sample("spread", dist.HalfNormal(5.0))
+    slope = numpyro.sample("slope", dist.Normal(0.0, 3.0))
+    with numpyro.plate("place", n_site):
+        level = numpyro.sample("level", dist.Normal(mean, spread))
+    expected = numpyro.deterministic("expected", level[site] + slope * x)
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(expected, 0.5), obs=y)
+
+
+def bend():
+    return Effect(
+        "bend",
+        {"expected": lambda value, p, context: value + p["size"] * (context["x"] ** 2 - 1)},
+        (Parameter("size", dist.Normal(0.0, 1.0)),),
+        requires=("x",),
+    )
+
+
+def slopes():
+    return Effect(
+        "slopes",
+        {"expected": lambda value, p, context: value + p["sd"] * p["field"][context["site"]] * context["x"]},
+        (Parameter("sd", dist.HalfNormal(1.0, validate_args=False)),),
+        kind="variance",
+        field_shape=lambda *_: (N_SITE,),
+        requires=("x", "site"),
+    )
+
+
+@pytest.fixture
+def data():
+    rng = np.random.default_rng(2)
+    site, x = rng.integers(0, N_SITE, N_ROW), rng.normal(size=N_ROW)
+    site[:N_SITE] = np.arange(N_SITE)
+    level = 3.0 + SPREAD * rng.normal(size=N_SITE)
+    y = level[site] + 1.5 * x + 0.5 * rng.normal(size=N_ROW)
+    return {"x": x, "site": site, "day": rng.integers(0, 30, N_ROW), "y": y}
+
+
+def test_levels_belong_to_the_clusters_that_their_column_makes(data):
+    problem = Problem(sensors, data, [bend(), slopes()], "site")
+    level = problem.layout["level"]
+    assert level.local
+    assert level.index.shape == (N_SITE, 1)
+    assert not problem.layout["mean"].local
+    field = problem.with_live(["slopes"]).layout["slopes.field"]
+    assert field.local
+    x = problem.prior_draws(jax.random.key(1), 1)[0]
+    before = problem.compiled.by_cluster(x)
+    x[level.index[7]] += 1.0
+    changed = problem.compiled.by_cluster(x) != before
+    np.testing.assert_array_equal(np.flatnonzero(changed), [7])
+
+
+@pytest.mark.parametrize("cluster", ["day", None])
+def test_levels_that_clusters_share_belong_to_none(data, cluster):
+    problem = Problem(sensors, data, [slopes()], cluster)
+    assert "level" not in problem.declaration.latent
+    assert not problem.layout["level_decentered"].local
+    assert not problem.with_live(["slopes"]).layout["slopes.field"].local
+
+
+def test_a_level_that_acts_in_two_clusters_is_not_one_clusters_own(data):
+    def leaking(x, site, day, y=None):
+        with numpyro.plate("place", N_SITE):
+            level = numpyro.sample("level", dist.Normal(0.0, 3.0))
+        next_one = jnp.where(jnp.arange(N_SITE) == 4, jnp.roll(level, 1), 0.0)
+        with numpyro.plate("row", len(x)):
+            numpyro.sample("y", dist.Normal((level + next_one)[site], 0.5), obs=y)
+
+    assert not Problem(leaking, data, [], "site").layout["level"].local
+
+
+@pytest.mark.parametrize("cluster", ["site", "day", None])
+def test_the_spread_of_levels_is_found(data, cluster):
+    """A joint mode of levels and their spread would have a spread of 0."""
+    start = based(Problem(sensors, data, [], cluster), jax.random.key(0))
+    assert start.fitted.converged
+    sites = start.problem.compiled.sites(start.fitted.x)
+    assert abs(float(sites["slope"]) - 1.5) < 0.15
+    low = SPREAD / 2
+    assert low < float(sites["spread"]) < 5 * SPREAD
+    np.testing.assert_allclose(np.std(sites["level"]), SPREAD, rtol=0.4)
+
+
+def test_standard_units_leave_the_density_as_it_is(data):
+    """Of the level by its spread: log N(a; m, s) + log s = log N((a - m) / s; 0, 1)."""
+    drawn = decentred(sensors, data, ["level", "slope"])
+    site = numpyro.handlers.trace(numpyro.handlers.seed(drawn, 0)).get_trace(**data)
+    assert site["level"]["type"] == "deterministic"
+    assert "slope_decentered" not in site
+    unit = site["level_decentered"]["value"]
+    expected = site["mean"]["value"] + site["spread"]["value"] * unit
+    np.testing.assert_allclose(site["level"]["value"], expected, rtol=1e-5)
+    assert decentred(sensors, data, ["slope"]) is sensors
+
+
+@pytest.mark.parametrize("cluster", ["site", "day"])
+def test_a_cause_beside_levels_is_told(data, cluster):
+    bent = {**data, "y": data["y"] + 0.4 * (data["x"] ** 2 - 1)}
+    for given, verdict in ((data, "NO_GAP"), (bent, "LISTED")):
+        found = diagnose(
+            sensors, given, (bend(), slopes()), cluster=cluster, engine=Laplace(), key=jax.random.key(0)
+        )
+        assert found.verdict == verdict
+    assert found.causes[0].effects == ("bend",)
