@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.fitting.fit import Fit
+from dtprob.gap.fitting.leverage import lost_spread
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -78,7 +79,8 @@ def replicate(
 
 def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
     """Rows of the data (cluster, row) as if nothing had been fitted, and projected."""
-    raw = projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)))
+    residual = np.asarray(problem.compiled.residual(fitted.x)) + lost_spread(problem, projection)
+    raw = projection.before_fit(residual)
     return raw, projection.rows(raw[None])[0]
 
 

@@ -84,9 +84,8 @@ class Projection:
 
     def adjust(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effect columns (cluster, row, k) after projection, and B's part that falls on the global nuisances."""
-        w = self._without_local(w, slice(None))
         coefficients = self.global_inverse @ _product(self.reduced, w)
-        return w - self.reduced @ coefficients, coefficients
+        return self._without_local(w, slice(None)) - self.reduced @ coefficients, coefficients
 
     def information(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """W' P W and B's part that falls on the global nuisances, of effect columns W (cluster, row, k).
@@ -94,8 +93,7 @@ class Projection:
         P W, the columns after projection, are made of a few clusters at a time.
         """
         parts = [slice(low, low + _TOGETHER) for low in range(0, len(w), _TOGETHER)]
-        cross = sum((_product(self.reduced[c], self._without_local(w[c], c)) for c in parts), np.zeros(()))
-        coefficients = self.global_inverse @ cross
+        coefficients = self.global_inverse @ _product(self.reduced, w)
         found = np.zeros((w.shape[-1], w.shape[-1]))
         for c in parts:
             adjusted = self._without_local(w[c], c) - self.reduced[c] @ coefficients
@@ -111,8 +109,7 @@ class Projection:
 
     def adjoint(self, e: np.ndarray) -> np.ndarray:
         """Rows P' e (..., cluster, row), whose products with columns W are those of e with P W."""
-        e = e - _all(self.reduced, _scores(self.reduced, e) @ self.global_inverse.T)
-        return e - self._moved_alone(e)
+        return e - self._moved_alone(e) - _all(self.reduced, _scores(self.reduced, e) @ self.global_inverse.T)
 
     def _moved_alone(self, e: np.ndarray) -> np.ndarray:
         """What a refit of the local coordinates alone moves of rows (..., cluster, row)."""

@@ -117,6 +117,11 @@ def location_rows(family: str, n_rows: int) -> int:
     return n_rows if located is None else located
 
 
+def log_scale(family: str) -> float | None:
+    """Logarithm of the scale for a unit step of the first row that is no location; None unless the others are normal."""
+    return LIKELIHOODS[family].log_scale
+
+
 def is_joint(family: str) -> bool:
     """Whether entries along the last axis are one vector, of which no entry stands alone."""
     return LIKELIHOODS[family].log_prob is not None
