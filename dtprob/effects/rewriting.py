@@ -58,11 +58,12 @@ class Rewriting(Messenger):
         context = Context(self._data, self._seen)
         for effect in self._effects:
             if msg["type"] == "sample":
-                rewrite = effect.distributions.get(msg["name"])
-                if rewrite is not None:
-                    msg["fn"] = rewrite(msg["fn"], self._given(effect, msg, context), context)
-            elif (rewrite := effect.rewrites.get(msg["name"])) is not None:
-                value = rewrite(msg["value"], self._given(effect, msg, context), context)
+                if msg["name"] in effect.distributions:
+                    given = self._given(effect, msg, context)
+                    msg["fn"] = rewritten(effect, msg["name"], msg["fn"], given, context)
+            elif msg["name"] in effect.rewrites:
+                given = self._given(effect, msg, context)
+                value = rewritten(effect, msg["name"], msg["value"], given, context)
                 msg["value"] = _fit(effect.name, msg["name"], msg["value"], value)
 
     def postprocess_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -83,6 +84,37 @@ class Rewriting(Messenger):
             drawn = numpyro.sample(name, normal, infer={"block_plates": plates})
             self._fields[effect.name] = jnp.asarray(drawn)
         return {**given, FIELD: self._fields[effect.name]}
+
+
+def rewritten(effect: Effect, site: str, value: Any, given: Mapping[str, Any], context: Context) -> Any:
+    """What an effect makes of a site's value or distribution.
+
+    Raises:
+        InputError: the rewrite fails; it is named.
+    """
+    rewrite = {**effect.distributions, **effect.rewrites}[site]
+    try:
+        return rewrite(value, given, context)
+    except KeyError as error:
+        own = (
+            f"; it looks for its own site, which is its first argument {site!r}"
+            if error.args == (site,)
+            else ""
+        )
+        raise InputError(
+            f"effect {effect.name}, rewrite of site {site!r}",
+            f"its parameters ({', '.join(given)}), arguments of the model and earlier sites ({', '.join(context)})",
+            f"{error}{own}",
+            "Correct the name, or give the model what the effect needs.",
+        ) from error
+    except (TypeError, ValueError) as error:
+        said = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+        raise InputError(
+            f"effect {effect.name}, rewrite of site {site!r}",
+            f"a function that can be traced, on a value of shape {jnp.shape(value) if hasattr(value, 'shape') else ()}",
+            said,
+            "Correct it; --debug shows where it fails.",
+        ) from error
 
 
 def may_become(old: Sequence[int], new: Sequence[int]) -> bool:

@@ -54,6 +54,17 @@ def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> 
     return np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
 
 
+def largest_tail(largest: np.ndarray) -> np.ndarray:
+    """Upper-tail p-values of the largest of many squared scores over their variance: of replicates, and of the data, last.
+
+    The replicates' own are taken as Gumbel, which the largest square of many normal scores is.
+    """
+    null = largest[:-1]
+    scale = max(float(null.std()) * np.sqrt(6.0) / np.pi, 1e-12)
+    log_rate = -(largest - float(null.mean())) / scale - np.euler_gamma
+    return np.maximum(-np.expm1(-np.exp(np.minimum(log_rate, 30.0))), np.exp(LOG_SMALLEST))
+
+
 def variance_ratio_tail(observed: np.ndarray, mean: float, variance: float, replicates: int) -> np.ndarray:
     """Upper-tail p-values of sums of squares, each over its variance in so many replicates: an F distribution.
 

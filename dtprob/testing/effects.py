@@ -26,7 +26,7 @@ def check_effect(
 ) -> None:
     """Check that an effect is one that a diagnosis can use on a model.
 
-    It says its physics, source and units; its sites are the model's; at its null the run of the model is
+    It says its physics and units; its sites are the model's; at its null the run of the model is
     unchanged, bit for bit; away from it shapes and types stay and values are finite; its derivative at the
     null agrees with finite differences; its priors are proper and reach the null.
 
@@ -41,7 +41,7 @@ def check_effect(
     """
     key = jax.random.key(0) if key is None else key
     what = f"effect {effect.name}"
-    for name in ("family", "physics", "source"):
+    for name in ("family", "physics"):
         expect(getattr(effect, name), what, f"a text for {name!r}", "none", "Say it in a line")
     for parameter in effect.parameters:
         _check_parameter(f"{what}, parameter {parameter.name!r}", parameter, key)

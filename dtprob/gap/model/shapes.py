@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.effect import FIELD, Context, Effect
-from dtprob.effects.rewriting import Rewriting
+from dtprob.effects.rewriting import Rewriting, rewritten
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import transform_of
 from dtprob.gap.model.running import Arrays, Runner, observations
@@ -78,7 +78,7 @@ def perturbed_sites(
         while True:  # a site may grow because one before it has
             found = runner.run(jnp.zeros(runner.layout.dimension), arrays, grown)
             values = {n: found.sites[n] for n in names}
-            shapes = _largest(effects, values, Context(data, found.everything))
+            shapes = _largest(effects, values, data, found.everything, list(declared.declaration.sites))
             grown = {n: jnp.zeros(s, values[n].dtype) for n, s in shapes.items()}
             if all(grown[n].shape == values[n].shape for n in values):
                 return grown
@@ -88,17 +88,23 @@ def perturbed_sites(
 
 
 def _largest(
-    effects: Sequence[Effect], values: Mapping[str, Any], context: Context
+    effects: Sequence[Effect],
+    values: Mapping[str, Any],
+    data: Mapping[str, Any],
+    everything: Mapping[str, Any],
+    order: Sequence[str],
 ) -> dict[str, tuple[int, ...]]:
-    """The largest shape that any effect gives each site."""
+    """The largest shape that any effect gives each site, what it looks at having come before the site."""
     shapes = {name: value.shape for name, value in values.items()}
+    before = {name: {n: everything[n] for n in order[:i]} for i, name in enumerate(order)}
     for effect in effects:
         parameters = effect.null()
         if effect.kind == "variance":
+            context = Context(data, everything)
             parameters[FIELD] = jnp.zeros(effect.shape_of_field(values[effect.sites[0]], context))
-        for site, rewrite in effect.rewrites.items():
-            shape = jnp.shape(rewrite(values[site], parameters, context))
-            shapes[site] = np.broadcast_shapes(shapes[site], shape)
+        for site in effect.rewrites:
+            new = rewritten(effect, site, values[site], parameters, Context(data, before[site]))
+            shapes[site] = np.broadcast_shapes(shapes[site], jnp.shape(new))
     return shapes
 
 

@@ -122,6 +122,11 @@ def log_scale(family: str) -> float | None:
     return LIKELIHOODS[family].log_scale
 
 
+def is_outcome(family: str) -> bool:
+    """Whether one of a few outcomes is seen."""
+    return LIKELIHOODS[family].is_outcome
+
+
 def is_joint(family: str) -> bool:
     """Whether entries along the last axis are one vector, of which no entry stands alone."""
     return LIKELIHOODS[family].log_prob is not None

@@ -183,6 +183,20 @@ def cycles(size: int, over: str) -> tuple[Curves, ...]:
     )
 
 
+def stretches(size: int, over: str) -> tuple[Curves, ...]:
+    """Half-overlapping stretches of an axis of some positions, 2, 4, 8 ... long, each with a weight; none of short axes."""
+    if size < _SMOOTH_FROM:
+        return ()
+    lengths = [2**k for k in range(1, int(np.log2(size)))]
+    windows = [(low, low + n) for n in lengths for low in range(0, size - n + 1, n // 2)]
+    weight = np.repeat(np.arange(len(windows)), [stop - low for low, stop in windows])
+    position = np.concatenate([np.arange(*window) for window in windows])
+    shape = (len(windows), size)
+    return (
+        Curves(f"stretch of {over}", sparse.csr_matrix((np.ones(len(weight)), (weight, position)), shape)),
+    )
+
+
 def _over(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     """Smooth over a column (size,), and ripples over its values."""
     yield Curves(f"along {name}", _smooth(column))

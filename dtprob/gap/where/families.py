@@ -8,19 +8,22 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, final
 
 import jax.numpy as jnp
 import numpy as np
+from scipy import sparse
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.where.curves import Curves, Quantity, cycles
+from dtprob.gap.where.curves import Curves, Quantity, cycles, stretches
 
 _ROWS: Final = 8
 """Positions of a second axis from which rows may follow one another from cluster to cluster."""
 _COLUMNS: Final = 16
 """Entries beside the rows up to which each is looked at."""
+_MOST_OF_STRETCHES: Final = 1 << 16
+"""Entries of a site of which stretches are looked at."""
 
 type Along = Callable[[str, int], Sequence[Curves]]
 type Over = Sequence[tuple[Quantity, Sequence[Curves]]]
@@ -222,6 +225,18 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
                 each = " x ".join(site.axes[i] for i in rest)
                 yield from (Pattern(f"{found.label} x {each}", kept + rest, found) for found in all_curves)
     yield from _cycles(site)
+    yield from _stretches(site)
+
+
+def _stretches(site: Site) -> Iterator[Pattern]:
+    """Stretches of the last axis of what lies along one or two, those of each position of the first apart."""
+    shape = site.value.shape
+    if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_STRETCHES:
+        return
+    for found in stretches(shape[-1], site.axes[-1]):
+        each = sparse.kron(sparse.identity(shape[0]), found.values, "csr") if len(shape) > 1 else found.values
+        label = f"{found.label} x {site.axes[0]}" if len(shape) > 1 else found.label
+        yield Pattern(label, tuple(range(len(shape))), replace(found, label=label, values=each))
 
 
 def _cycles(site: Site) -> Iterator[Pattern]:

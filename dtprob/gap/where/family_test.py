@@ -7,11 +7,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dtprob.gap.tails import variance_ratio_tail
+from dtprob.gap.tails import largest_tail, variance_ratio_tail
 from dtprob.gap.where.families import Family
 
 CHANCE: Final = 8
 """Replicates that tell what a site would gain by chance."""
+_SEVERAL: Final = 8
+"""Entries from which on the largest is looked at beside the sum."""
 _OTHERS: Final = 1e-9
 """Share of an entry's variance below which the other replicates tell nothing of it: rare outcomes move but one."""
 _AT_ONCE: Final = 1 << 17
@@ -37,35 +39,44 @@ class FamilyTest(NamedTuple):
 
 
 def family_test(family: Family, scores: np.ndarray) -> FamilyTest:
-    """Test a family's summed squared scores (1 + replicate, entry), each entry scaled by its null variance."""
+    """Test a family's squared scores (1 + replicate, entry), each entry scaled by its null variance.
+
+    Their sum notices what is wrong everywhere, their largest what is wrong at a few entries of many; the p-value is the
+    smaller one's, of the data and of the replicates alike.
+    """
     first, n = scores[: 1 + CHANCE].copy(), len(scores) - 1
     total = np.einsum("ne,ne->e", scores[1:], scores[1:])
     alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
     if not alive.any():
         return FamilyTest(family, 1.0, np.ones(n), first, total / n)
-    statistic = (n - 1) * _against_the_others(scores[1:], np.where(alive, total, np.inf))
-    value = n * float((scores[0, alive] ** 2 / total[alive]).sum())
+    summed, largest = _against_the_others(scores[1:], np.where(alive, total, np.inf))
+    statistic, own = (n - 1) * summed, scores[0, alive] ** 2 / total[alive]
     p = variance_ratio_tail(
-        np.append(statistic, value), float(statistic.mean()), float(statistic.var()), n - 1
+        np.append(statistic, n * own.sum()), float(statistic.mean()), float(statistic.var()), n - 1
     )
+    if alive.sum() >= _SEVERAL:
+        p = np.minimum(p, largest_tail(np.append((n - 1) * largest, n * own.max())))
     return FamilyTest(family, float(p[-1]), p[:-1], first, total / n)
 
 
 def _against_the_others(
     scores: Float[np.ndarray, "replicate entry"], total: Float[np.ndarray, " entry"]
-) -> Float[np.ndarray, " replicate"]:
-    """Each replicate's squared scores over the sum of the others', summed over the entries a few at a time.
+) -> tuple[Float[np.ndarray, " replicate"], Float[np.ndarray, " replicate"]]:
+    """Each replicate's squared scores over the sum of the others', their sum and the largest, a few entries at a time.
 
     Args:
         scores: of the replicates.
         total: sum of their squares, infinite where an entry does not count.
     """
-    found, width = np.zeros(len(scores)), max(_AT_ONCE // len(scores), 1)
+    summed, largest = np.zeros((2, len(scores)))
+    width = max(_AT_ONCE // len(scores), 1)
     for start in range(0, len(total), width):
         own = scores[:, start : start + width] ** 2
         others = total[start : start + width] - own
         alone = others < _OTHERS * total[start : start + width]
         if alone.any():
             own[alone], others[alone] = 0.0, 1.0
-        found += (own / others).sum(1)
-    return found
+        ratio = own / others
+        summed += ratio.sum(1)
+        np.maximum(largest, ratio.max(1), out=largest)
+    return summed, largest

@@ -237,3 +237,17 @@ def test_an_inner_extension_sees_what_the_outer_one_did():
     fixed = {"follow.share": 2.0, "lift.by": 3.0}
     for extended in (with_effects(with_effects(two, [follow]), [lift]), with_effects(two, [follow, lift])):
         assert handlers.substitute(extended, data=fixed)(x=jnp.ones(())) == 8.0
+
+
+def test_an_effect_whose_rewrite_fails_is_named():
+    def run(rewrite):
+        effect = Effect("wrong", {"mean": rewrite}, (Parameter("size", dist.Normal()),))
+        with Rewriting(None, [effect], {"wrong": {"size": jnp.zeros(())}}, {"x": jnp.ones(6)}):
+            numpyro.deterministic("mean", jnp.zeros(6))
+
+    with pytest.raises(InputError, match=r"effect wrong, rewrite of site 'mean': .*\(x\), got 'hours'"):
+        run(lambda value, p, context: value + p["size"] * context["hours"])
+    with pytest.raises(InputError, match="its own site, which is its first argument"):
+        run(lambda value, p, context: value + p["size"] * context["mean"])
+    with pytest.raises(InputError, match=r"effect wrong, rewrite of site 'mean': .*value of shape \(6,\)"):
+        run(lambda value, p, context: value + p["size"] * jnp.ones(5))

@@ -69,7 +69,7 @@ def drawn(links, readings, seed, few=()):
 
 def test_squares_are_lower_by_the_leverage():
     """Mean of the rows at modes of the levels, over data sets, with the noise as it is."""
-    few, sets, rows = range(15), 60, 0.0
+    few, sets, rows = range(15), 20, 0.0
     volume = Volume(np.zeros(2), np.zeros(30), np.zeros((30, 2)), np.zeros((30, 2, 2)))
     for seed in range(sets):
         problem = Problem(levels, drawn(30, 6, seed, few), [])
@@ -122,7 +122,7 @@ def test_many_small_clusters_ring_no_alarm(links, readings, few):
 def test_scores_beside_levels_have_the_spread_that_they_claim():
     """z of a candidate over data sets without it, with two readings of each level."""
     z = []
-    for seed in range(30):
+    for seed in range(12):
         problem = Problem(levels, drawn(60, 2, 100 + seed), [hill()])
         start = based(problem, KEY)
         seen = view(start.problem, start.fitted, KEY, Settings(replicates=50, site_replicates=39))

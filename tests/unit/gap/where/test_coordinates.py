@@ -8,13 +8,14 @@ import pytest
 from dtprob.gap.where.coordinates import scan_coordinates
 
 
-def scanned(observed, null):
+def scanned(observed, null, *, outcomes=False):
     """The scan of residuals (cluster, row), one row for each of three devices."""
     position = np.broadcast_to(np.arange(3), observed.shape)
     rows = SimpleNamespace(
         located=np.ones(observed.shape), coordinates={"device": position}, by_cluster=lambda values: values
     )
-    problem = SimpleNamespace(rows=rows, declaration=SimpleNamespace(cluster="link"))
+    families = {"heard": "BernoulliLogits" if outcomes else "Normal"}
+    problem = SimpleNamespace(rows=rows, declaration=SimpleNamespace(cluster="link"), families=families)
     return scan_coordinates(problem, SimpleNamespace(rows=np.stack([observed, *null])))
 
 
@@ -35,3 +36,14 @@ def test_a_position_that_strays_is_found():
     blocks, _ = scanned(observed, null)
     assert (blocks[0].axis, blocks[0].low, blocks[0].high) == ("device", 1, 1)
     assert blocks[0].p_value < 1e-3
+
+
+def test_one_rare_outcome_is_no_misfit_that_replicates_have_not_seen():
+    """Of 150 outcomes that are seen with a chance of .001 each one is seen: no device stands out for it."""
+    rng, chance = np.random.default_rng(2), 1e-3
+    observed = np.full((50, 3), -np.sqrt(chance / (1 - chance)))
+    null = np.repeat(observed[None], 200, axis=0) + 1e-3 * rng.standard_normal((200, 50, 3))
+    observed[17, 1] = np.sqrt((1 - chance) / chance)
+    assert scanned(observed, null, outcomes=True)[0] == ()
+    observed[:25, 1] = observed[17, 1]  # half of them are another matter
+    assert scanned(observed, null, outcomes=True)[0][0].p_value < 1e-3

@@ -1,0 +1,46 @@
+"""The test of a family of scores: dense and sparse departures, and the level where there is none."""
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from dtprob.gap.where.curves import stretches
+from dtprob.gap.where.families import Family, Pattern
+from dtprob.gap.where.family_test import family_test
+
+FAMILY = Family("additive", Pattern("link", (0,)), np.ones(()))
+
+
+def p_of(shift, seed, entries=300, replicates=99):
+    rng = np.random.default_rng(seed)
+    scores = rng.standard_normal((1 + replicates, entries)) * np.geomspace(0.1, 10, entries)
+    scores[0] += shift * np.geomspace(0.1, 10, entries)
+    return family_test(FAMILY, scores)
+
+
+def test_one_entry_of_many_is_noticed():
+    one = np.zeros(300)
+    one[123] = 7.0
+    assert max(p_of(one, seed).p_value for seed in range(10)) < 1e-3
+
+
+def test_a_little_everywhere_is_noticed():
+    assert max(p_of(np.full(300, 1.0), seed).p_value for seed in range(10)) < 1e-3
+
+
+@pytest.mark.parametrize("entries", [4, 40, 400])
+def test_p_values_where_nothing_is_wrong(entries):
+    """Not below a level more often than twice it (two statistics), one time in a thousand; replicates likewise."""
+    found = [p_of(0.0, seed, entries) for seed in range(300)]
+    for level in (0.01, 0.05):
+        assert sum(t.p_value <= level for t in found) <= stats.binom.isf(1e-3, 300, 2 * level)
+    null = np.concatenate([t.null for t in found])
+    assert (null <= 0.01).mean() <= 0.025
+
+
+def test_stretches_are_sums_over_windows():
+    (found,) = stretches(20, "hour")
+    values = np.arange(20.0)
+    windows = [(low, low + n) for n in (2, 4, 8) for low in range(0, 21 - n, n // 2)]
+    np.testing.assert_allclose(found.values @ values, [values[a:b].sum() for a, b in windows])
+    assert stretches(4, "hour") == ()
