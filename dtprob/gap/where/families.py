@@ -217,6 +217,8 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
     for i, axis in enumerate(site.axes):
         for found in along(axis, site.value.shape[i]):
             yield Pattern(found.label, (i,), found)
+            if i == 0 and site.value.ndim == 2 and 1 < site.value.shape[1] <= _COLUMNS:
+                yield Pattern(f"{found.label} x {site.axes[1]}", (0, 1), found)
     for quantity, all_curves in over:
         if (kept := quantity.kept(site.axes, site.value.shape)) is not None:
             yield from (Pattern(found.label, kept, found) for found in all_curves)
