@@ -38,9 +38,13 @@ def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
 
     def spreads(key: jax.Array, arrays: Any) -> dict[str, jax.Array]:
         trace = trace_model(model, eqx.combine(arrays, static), key)
-        ways.update({n: way for n in shared if (way := _way(trace[n]["fn"])) is not None})
+        found = {n: _way(trace[n]["fn"]) for n in shared}
+        ways.update({n: way for n, way in found.items() if way is not None})
         return {n: jnp.asarray(_inner(trace[n]["fn"]).scale) for n in ways}
 
+    jax.eval_shape(spreads, jax.random.key(0), arrays)
+    if not ways:
+        return model
     told = jax.jit(jax.vmap(spreads, in_axes=(0, None)))(jax.random.split(jax.random.key(0)), arrays)
     ways = {n: way for n, way in ways.items() if bool((told[n][0] != told[n][1]).any())}
     if not ways:
@@ -56,9 +60,11 @@ def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
 
 
 def _way(fn: Any) -> LocScaleReparam | None:
-    """How to draw from a distribution in standard units, where it has a location and a scale."""
+    """How to draw from a distribution in standard units, where it has a location and a scale that something tells."""
     names = set(_inner(fn).arg_constraints)
     if not names >= _SCALED or base_constraint(fn.support) is not constraints.real:
+        return None
+    if not isinstance(_inner(fn).scale, jax.core.Tracer):
         return None
     return LocScaleReparam(0.0, shape_params=sorted(names - _SCALED))
 

@@ -6,8 +6,8 @@ clusters by `site`, the model is asked: an entry belongs to a cluster if nothing
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from typing import Final, NamedTuple
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from typing import TYPE_CHECKING, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,10 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dtprob.models.declaration import Declaration
+
+if TYPE_CHECKING:
+    from dtprob.gap.model.layout import Block
+    from dtprob.gap.model.problem import Problem
 
 _SPLITS: Final = 8
 """Halves of the clusters whose entries are moved: two clusters lie in one half of all with probability 2^-8."""
@@ -40,6 +44,36 @@ class Own(NamedTuple):
         """Log density (*site) summed to (cluster,)."""
         first = jnp.moveaxis(density, self.axis, 0)[self.position]
         return first.reshape(len(self.position), -1).sum(1)
+
+
+def of_latents(problem: Problem) -> dict[str, Own]:
+    """Which latent sites have entries for each cluster, asked of a problem in which none counts as having any."""
+    if problem.column is None:
+        shapes = {b.name: b.shape for b in problem.blocks_of(None)}
+        return along_axis(problem.declaration, shapes, problem.n_cluster)
+    return _moved_along_column(problem, problem.blocks_of(None))
+
+
+def of_fields(problem: Problem) -> dict[str, Own]:
+    """The same of the fields of variance effects, where a column makes the clusters."""
+    found: dict[str, Own] = {}
+    for name in problem.field_shapes:
+        with_it = problem.with_live([name])
+        found |= _moved_along_column(with_it, [with_it.field_of(with_it.live[0])])
+    return found
+
+
+def _moved_along_column(problem: Problem, blocks: Iterable[Block]) -> dict[str, Own]:
+    wide = {b.name: b.index.reshape(b.shape) for b in blocks if problem.n_cluster in b.shape}
+    if not wide:
+        return {}
+
+    def told(x: np.ndarray) -> tuple[np.ndarray, float]:
+        likelihood, prior, _ = problem.compiled.evaluate(x)
+        return likelihood, float(prior)
+
+    column = np.asarray(problem.data[str(problem.column)])
+    return along_column(wide, column, problem.prior_draws(jax.random.key(0), 1)[0], told)
 
 
 def along_axis(

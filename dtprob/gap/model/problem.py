@@ -18,11 +18,12 @@ import numpy as np
 
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.errors import InputError
+from dtprob.gap.model import own
 from dtprob.gap.model.compiled import Compiled
 from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import Block, Layout, make_layout, normal_of, transform_of
-from dtprob.gap.model.own import Own, along_axis, along_column
+from dtprob.gap.model.own import Own
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.model.rows import Rows, make_rows
@@ -63,10 +64,10 @@ class Problem:
     ) -> None:
         self.data, self.effects = dict(data), tuple(effects)
         self.arrays, static = split_static(data)
-        self._column = (
+        self.column = (
             cluster if cluster is not None and cluster in data and np.ndim(data[cluster]) == 1 else None
         )
-        self._cluster = None if self._column else cluster
+        self._cluster = None if self.column else cluster
         self._declare(model, static)
         self._check_effects()
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -74,14 +75,15 @@ class Problem:
         self.volume: Volume | None = None
         self.own: dict[str, Own] = {}
         self.set_live(())
-        self.own = self._found_own()
-        self.set_live(())
+        self.own = own.of_latents(self)
+        if self.own:
+            self.set_live(())
         shared = self.declaration.latent.keys() - self.own.keys()
         drawn = model if reference is not None else decentred(model, data, shared)
         if drawn is not model:
             self._declare(drawn, static)
             self.set_live(())
-        self.own |= self._found_own_fields()
+        self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
             self.known = normal_of(self._reference_draws(reference))
             self.set_live(())
@@ -99,7 +101,7 @@ class Problem:
         self.located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
         joint = [n for n, f in families.items() if whiten.is_joint(f)]
         self.rows: Rows = make_rows(
-            self.declaration, shapes, self.located, self.data, self._column, joint=joint
+            self.declaration, shapes, self.located, self.data, self.column, joint=joint
         )
         self.layout: Layout = self._make_layout()
         self._runner = Runner(
@@ -264,52 +266,23 @@ class Problem:
         entries: list[tuple[str, str | None, tuple[int, ...]]] = [
             (name, None, shapes[name]) for name in self.declaration.latent
         ]
-        own, count = dict(self.own), self.n_cluster
+        found, count = dict(self.own), self.n_cluster
         for effect in self.live:
             if effect.kind == "variance":
                 name, shape = effect.site_name(FIELD), self.field_shapes[effect.name]
                 entries.append((name, effect.name, shape))
                 axis = self._axis_of_clusters(effect)
-                if name not in own and axis is not None and axis < len(shape) and shape[axis] == count:
-                    own[name] = Own(axis, np.arange(count))
+                if name not in found and axis is not None and axis < len(shape) and shape[axis] == count:
+                    found[name] = Own(axis, np.arange(count))
             entries += [(effect.site_name(p.name), effect.name, p.shape) for p in effect.fitted]
-        return make_layout(entries, own)
+        return make_layout(entries, found)
 
     def _axis_of_clusters(self, effect: Effect) -> int | None:
         """Along which axis of its field a variance effect has entries for each cluster."""
         if effect.name in self.per_cluster:
             return 0
         axes, cluster = self.declaration.sites[effect.sites[0]].axes, self.declaration.cluster
-        return axes.index(cluster) if self._column is None and cluster in axes else None
-
-    def _found_own(self) -> dict[str, Own]:
-        """Which latent sites have entries for each cluster; none counts as having any before."""
-        if self._column is None:
-            shapes = latent_shapes(self._declared, self.arrays)
-            return along_axis(self.declaration, shapes, self.n_cluster)
-        return self._along_column({b.name: b for b in self.blocks_of(None)}, self)
-
-    def _found_own_fields(self) -> dict[str, Own]:
-        """The same of the fields of variance effects, where a column makes the clusters."""
-        found: dict[str, Own] = {}
-        for name in {} if self._column is None else self.field_shapes:
-            with_it = self.with_live([name])
-            block = with_it.field_of(with_it.live[0])
-            found |= self._along_column({block.name: block}, with_it)
-        return found
-
-    def _along_column(self, blocks: Mapping[str, Block], of: Problem) -> dict[str, Own]:
-        """Which of a problem's blocks have entries for each cluster, found by moving them."""
-        wide = {n: b.index.reshape(b.shape) for n, b in blocks.items() if self.n_cluster in b.shape}
-        if not wide:
-            return {}
-
-        def told(x: np.ndarray) -> tuple[np.ndarray, float]:
-            likelihood, prior, _ = of.compiled.evaluate(x)
-            return likelihood, float(prior)
-
-        column = np.asarray(self.data[str(self._column)])
-        return along_column(wide, column, of.prior_draws(jax.random.key(0), 1)[0], told)
+        return axes.index(cluster) if self.column is None and cluster in axes else None
 
     # -- points ---------------------------------------------------------------------------------------------------
 

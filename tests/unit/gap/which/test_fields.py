@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dtprob.gap.model.programs import _weights
+from dtprob.gap.model.rewrites import _weights
 from dtprob.gap.tails import variance_ratio_tail
 from dtprob.gap.which.fields import field_tests
 
