@@ -14,6 +14,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from numpyro import handlers
 from numpyro.distributions import constraints
 from numpyro.infer.reparam import LocScaleReparam
@@ -64,7 +65,7 @@ def _way(fn: Any) -> LocScaleReparam | None:
     names = set(_inner(fn).arg_constraints)
     if not names >= _SCALED or base_constraint(fn.support) is not constraints.real:
         return None
-    if not isinstance(_inner(fn).scale, jax.core.Tracer):
+    if not isinstance(_inner(fn).scale, Tracer):
         return None
     return LocScaleReparam(0.0, shape_params=sorted(names - _SCALED))
 
