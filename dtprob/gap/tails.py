@@ -6,7 +6,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy import special
+from scipy import special, stats
 
 LOG_SMALLEST: Final = -660.0
 """Logarithms below this are not turned into probabilities."""
@@ -54,12 +54,21 @@ def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> 
     return np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
 
 
+_MOST_SKEW: Final = 1.7
+"""Skewness of what is taken as Gumbel, whose own is 1.14."""
+
+
 def largest_tail(largest: np.ndarray) -> np.ndarray:
     """Upper-tail p-values of the largest of many squared scores over their variance: of replicates, and of the data, last.
 
-    The replicates' own are taken as Gumbel, which the largest square of many normal scores is.
+    The replicates' own are taken as Gumbel, which the largest square of many normal scores is; where they are more skew,
+    their roots are. Where these are, too, as of rare outcomes, nothing is said.
     """
     null = largest[:-1]
+    if not stats.skew(null) < _MOST_SKEW:
+        largest, null = np.sqrt(largest), np.sqrt(null)
+    if not stats.skew(null) < _MOST_SKEW:  # or all alike
+        return np.ones_like(largest)
     scale = max(float(null.std()) * np.sqrt(6.0) / np.pi, 1e-12)
     log_rate = -(largest - float(null.mean())) / scale - np.euler_gamma
     return np.maximum(-np.expm1(-np.exp(np.minimum(log_rate, 30.0))), np.exp(LOG_SMALLEST))

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from dtprob.gap.tails import largest_tail, variance_ratio_tail
 from dtprob.gap.where.families import Family
@@ -14,6 +14,10 @@ CHANCE: Final = 8
 """Replicates that tell what a site would gain by chance."""
 _SEVERAL: Final = 8
 """Entries from which on the largest is looked at beside the sum."""
+_HEAVIEST: Final = 6.0
+"""Kurtosis of a score over replicates up to which the largest of several tells something; 3 of a normal one."""
+_MOSTLY: Final = 0.9
+"""Share of the entries that have to be no heavier."""
 _OTHERS: Final = 1e-9
 """Share of an entry's variance below which the other replicates tell nothing of it: rare outcomes move but one."""
 _AT_ONCE: Final = 1 << 17
@@ -49,26 +53,29 @@ def family_test(family: Family, scores: np.ndarray) -> FamilyTest:
     alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
     if not alive.any():
         return FamilyTest(family, 1.0, np.ones(n), first, total / n)
-    summed, largest = _against_the_others(scores[1:], np.where(alive, total, np.inf))
+    summed, largest, steady = _against_the_others(scores[1:], np.where(alive, total, np.inf))
     statistic, own = (n - 1) * summed, scores[0, alive] ** 2 / total[alive]
     p = variance_ratio_tail(
         np.append(statistic, n * own.sum()), float(statistic.mean()), float(statistic.var()), n - 1
     )
-    if alive.sum() >= _SEVERAL:
-        p = np.minimum(p, largest_tail(np.append((n - 1) * largest, n * own.max())))
+    if steady.sum() >= max(_SEVERAL, _MOSTLY * alive.sum()):
+        p = np.minimum(p, largest_tail(np.append((n - 1) * largest, n * own[steady[alive]].max())))
     return FamilyTest(family, float(p[-1]), p[:-1], first, total / n)
 
 
 def _against_the_others(
     scores: Float[np.ndarray, "replicate entry"], total: Float[np.ndarray, " entry"]
-) -> tuple[Float[np.ndarray, " replicate"], Float[np.ndarray, " replicate"]]:
-    """Each replicate's squared scores over the sum of the others', their sum and the largest, a few entries at a time.
+) -> tuple[Float[np.ndarray, " replicate"], Float[np.ndarray, " replicate"], Bool[np.ndarray, " entry"]]:
+    """Each replicate's squared scores over the sum of the others', a few entries at a time: their sum, and the largest.
+
+    The largest is that of the steady entries, which are returned, too: others move in few replicates only.
 
     Args:
         scores: of the replicates.
         total: sum of their squares, infinite where an entry does not count.
     """
     summed, largest = np.zeros((2, len(scores)))
+    steady = np.zeros(len(total), bool)
     width = max(_AT_ONCE // len(scores), 1)
     for start in range(0, len(total), width):
         own = scores[:, start : start + width] ** 2
@@ -76,7 +83,9 @@ def _against_the_others(
         alone = others < _OTHERS * total[start : start + width]
         if alone.any():
             own[alone], others[alone] = 0.0, 1.0
+        part = slice(start, start + own.shape[1])
+        steady[part] = (_HEAVIEST * total[part] ** 2 > len(scores) * (own**2).sum(0)) & (total[part] < np.inf)
         ratio = own / others
         summed += ratio.sum(1)
-        np.maximum(largest, ratio.max(1), out=largest)
-    return summed, largest
+        np.maximum(largest, np.max(ratio, axis=1, where=steady[part], initial=0.0), out=largest)
+    return summed, largest, steady

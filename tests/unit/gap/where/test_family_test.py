@@ -44,3 +44,17 @@ def test_stretches_are_sums_over_windows():
     windows = [(low, low + n) for n in (2, 4, 8) for low in range(0, 21 - n, n // 2)]
     np.testing.assert_allclose(found.values @ values, [values[a:b].sum() for a, b in windows])
     assert stretches(4, "hour") == ()
+
+
+def test_rare_outcomes_are_judged_by_their_sum():
+    """Hundreds of entries that move in a few replicates of a hundred: p-values are neither near 1 nor near 0."""
+    values = []
+    for seed in range(60):
+        rng = np.random.default_rng(seed)
+        chance = rng.choice([0.02, 0.1], 400)
+        scores = (rng.random((100, 400)) < chance) * 1.0 - chance
+        found = family_test(FAMILY, scores)
+        values.append(found.p_value)
+        assert found.null.min() > 1e-5
+    assert 0.2 < np.median(values) < 0.8
+    assert (np.array(values) < 0.02).sum() <= stats.binom.isf(1e-3, 60, 0.04)
