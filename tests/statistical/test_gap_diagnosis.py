@@ -83,7 +83,7 @@ def shared_compilation():
     plain = Problem.with_live
 
     def with_live(self, names):
-        if self.known or self._column in self.data or set(names) <= {e.name for e in self.live}:
+        if self.known or self.column in self.data or set(names) <= {e.name for e in self.live}:
             return plain(self, names)
         key = key_of(self.model, self.data, self.effects, self.declaration.cluster, names)
         return shared(key, lambda: plain(self, names), self.data)

@@ -280,12 +280,18 @@ def _step(suspect: Suspect, shape: tuple[int, ...], parts: int) -> Callable[[Any
     kept = tuple(n if i in pattern.kept else 1 for i, n in enumerate(shape))
     curves = pattern.curves
     values = None if curves is None else curves.values
-    groups = values.tocsc().indices if isinstance(values, sparse.csr_matrix) else None
+    spread_out = values.tocoo() if isinstance(values, sparse.csr_matrix) else None
     dense = jnp.asarray(values) if isinstance(values, np.ndarray) else None
 
     def step(weights: Any) -> jax.Array:
         pair = spread * (weights if curves is None else weights.reshape(curves.extent[0], -1))
-        along = pair if curves is None else pair[groups] if dense is None else dense.T @ pair
+        along = pair if dense is None else dense.T @ pair
+        if (
+            curves is not None and spread_out is not None
+        ):  # each position belongs to a few of very many weights
+            _, positions = curves.extent
+            own = spread_out.data[:, None] * pair[spread_out.row]
+            along = jnp.zeros((positions, pair.shape[1])).at[spread_out.col].add(own)
         along = along.reshape(*kept, parts)
         return factor * (along[..., 0] if parts == 1 else along[..., 0] + 1j * along[..., 1])
 
