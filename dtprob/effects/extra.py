@@ -89,11 +89,9 @@ def _over_any_point(paths: PathSet, measured: Band | None) -> Effect:
     tried.append(np.linspace(low[2], high[2], _HEIGHTS) if high[2] - low[2] > step / 2 else low[2:])
 
     def scatter(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        point, paths = jnp.stack([p[axis] for axis in _AXES]), context["paths"]
-        length = _leg(paths.tx_position, point)[1] + _leg(point, paths.rx_position)[1]
-        # The random phase takes up that of the carrier, which turns with every wavelength that the point moves.
-        turned = phasor(2 * jnp.pi * length / paths.wavelength)[:, None, None, None, None]
-        return value + p["scale"] / jnp.sqrt(2.0) * complex_of(p[FIELD]) * turned * _echo(context, point)
+        point = jnp.stack([p[axis] for axis in _AXES])
+        echo = _echo(context, point, carrier=False)
+        return value + p["scale"] / jnp.sqrt(2.0) * complex_of(p[FIELD]) * echo
 
     middles, spreads = (low + high) / 2, np.maximum((high - low) / np.sqrt(12), step)
     return Effect(
@@ -216,13 +214,14 @@ def _sums_paths(sites: Sites) -> bool:
 
 
 def _echo(
-    context: Mapping[str, Any], point: Any
+    context: Mapping[str, Any], point: Any, *, carrier: bool = True
 ) -> Complex[Array, "link 1 rx_antenna tx_antenna subcarrier"]:
-    """What a point of radar cross section 1 m^2 scatters to each link."""
+    """What a point of radar cross section 1 m^2 scatters to each link; see `_path`."""
     paths = context["paths"]
     first, second = _leg(paths.tx_position, point), _leg(point, paths.rx_position)
     loss = paths.wavelength / ((4 * jnp.pi) ** 1.5 * first[1] * second[1])
-    return loss[:, None, None, None, None] * _path(context, first[0], second[0], first[1] + second[1])
+    path = _path(context, first[0], second[0], first[1] + second[1], carrier=carrier)
+    return loss[:, None, None, None, None] * path
 
 
 def _path(
@@ -230,10 +229,16 @@ def _path(
     departure: Float[Array, "link 3"],
     arrival: Float[Array, "link 3"],
     length: Float[Array, " link"],
+    *,
+    carrier: bool = True,
 ) -> Complex[Array, "link 1 rx_antenna tx_antenna subcarrier"]:
-    """One path per link of unit gain, given by its directions of travel and its length in m."""
-    paths = context["paths"]
-    tones = 1.0 / paths.wavelength + jnp.asarray(context["subcarrier_frequency"]) / speed_of_light
+    """One path per link of unit gain, given by its directions of travel and its length in m.
+
+    Without the carrier its phase is that of the middle of the band: a random phase of each link takes up what turns with
+    every wavelength.
+    """
+    tones = jnp.asarray(context["subcarrier_frequency"]) / speed_of_light
+    tones = tones + 1.0 / context["paths"].wavelength if carrier else tones
     tone = phasor(-2 * jnp.pi * length[:, None] * tones)
     rx = _response(context, "rx", arrival, -1.0)
     tx = _response(context, "tx", departure, 1.0)

@@ -56,22 +56,29 @@ def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> 
 
 _MOST_SKEW: Final = 1.7
 """Skewness of what is taken as Gumbel, whose own is 1.14."""
+_ALIKE: Final = 1e-9
+"""Spread over mean up to which replicates are alike."""
 
 
 def largest_tail(largest: np.ndarray) -> np.ndarray:
     """Upper-tail p-values of the largest of many squared scores over their variance: of replicates, and of the data, last.
 
     The replicates' own are taken as Gumbel, which the largest square of many normal scores is; where they are more skew,
-    their roots are. Where these are, too, as of rare outcomes, nothing is said.
+    their roots are. Where these are, too, as of rare outcomes, or all alike, nothing is said.
     """
     null = largest[:-1]
-    if not stats.skew(null) < _MOST_SKEW:
+    if _is_too_skew(null):
         largest, null = np.sqrt(largest), np.sqrt(null)
-    if not stats.skew(null) < _MOST_SKEW:  # or all alike
+    if _is_too_skew(null):
         return np.ones_like(largest)
     scale = max(float(null.std()) * np.sqrt(6.0) / np.pi, 1e-12)
     log_rate = -(largest - float(null.mean())) / scale - np.euler_gamma
     return np.maximum(-np.expm1(-np.exp(np.minimum(log_rate, 30.0))), np.exp(LOG_SMALLEST))
+
+
+def _is_too_skew(null: np.ndarray) -> bool:
+    """Whether it is more skew than a Gumbel variable, or all alike but for rounding."""
+    return bool(null.std() <= _ALIKE * abs(null.mean()) or stats.skew(null) >= _MOST_SKEW)
 
 
 def variance_ratio_tail(observed: np.ndarray, mean: float, variance: float, replicates: int) -> np.ndarray:

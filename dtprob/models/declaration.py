@@ -289,12 +289,13 @@ def _site(message: Mapping[str, Any], notes: Metadata, data: Data) -> Site | Non
         plates=tuple(frame.name for frame in frames),
         is_complex=bool(np.issubdtype(jax.numpy.result_type(value), np.complexfloating)),
         support=fn.support if fn is not None else None,
-        distribution=type(_inner(fn)).__name__ if fn is not None else None,
+        distribution=type(innermost(fn)).__name__ if fn is not None else None,
         argument=_argument(name, value, data) if kind == "observed" else None,
     )
 
 
-def _inner(fn: Any) -> Any:
+def innermost(fn: Any) -> Any:
+    """The distribution without what changes its shape, weight or support."""
     while hasattr(fn, "base_dist"):
         fn = fn.base_dist
     return fn

@@ -7,12 +7,13 @@ and have none of it.
 
 from __future__ import annotations
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation import whiten
+from dtprob.gap.observation.likelihoods import LIKELIHOODS
 
 
 def lost_spread(problem: Problem, projection: Projection) -> Float[np.ndarray, "cluster row"]:
@@ -25,22 +26,17 @@ def lost_spread(problem: Problem, projection: Projection) -> Float[np.ndarray, "
         projection: at the fit.
     """
     own = projection.local_columns
-    lost = np.zeros(own.shape[:2])
     if not own.shape[-1]:
-        return lost
+        return np.zeros(own.shape[:2])
     leverage = np.einsum("cri,cij,crj->cr", own, projection.local_inverse, own)
-    flat, found, start = problem.rows.unstack(leverage), [], 0
-    for name, count in problem.components.items():
-        shape = problem.declaration.observed[name].shape
-        size = count * int(np.prod(shape, dtype=int))
-        rows, located = flat[start : start + size].reshape(count, *shape), problem.located[name]
-        start += size
-        part, scale = np.zeros_like(rows), whiten.log_scale(problem.families[name])
-        if scale is not None and located < count:
-            part[located] = scale * rows[:located].sum(axis=0)
-        found.append(part.reshape(-1))
-    padded = np.concatenate([*found, np.zeros(1)])
-    lost = padded[problem.rows.gather]
+    parts = problem.by_observation(leverage)
+    for name, rows in parts.items():
+        scale, located = LIKELIHOODS[problem.families[name]].log_scale, problem.located[name]
+        spread = None if scale is None else scale * rows[:located].sum(axis=0)
+        rows[:] = 0.0
+        if spread is not None and located < len(rows):
+            rows[located] = spread
+    lost = np.asarray(problem.rows.stack({name: jnp.asarray(rows) for name, rows in parts.items()}))
     return lost if problem.volume is not None else _without(lost, projection.columns)
 
 

@@ -10,7 +10,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import local_maxima, polish
 from dtprob.gap.fitting.marginal import settled
-from dtprob.gap.fitting.plausible import LARGE, nulls, places, scales, sides
+from dtprob.gap.fitting.plausible import LARGE, places, scales, sides
 from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -36,17 +36,9 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     """
     names = (*fitted.effects, effect.name)
     if effect.kind == "variance":
-        return fitting.fit(problem, _at_its_place(problem, fitted.x, effect), names)
+        return fitting.fit(problem, _at_null(problem, fitted.x, [effect.name]), names)
     best = max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
     return settled(problem, best)
-
-
-def _at_its_place(problem: Problem, x: np.ndarray, effect: Effect) -> np.ndarray:
-    """The point with an effect at its null: its place may have moved since it was last tried."""
-    x, null = x.copy(), problem.null()
-    for block in problem.blocks_of(effect.name):
-        x[block.index] = null[block.index]
-    return x
 
 
 def polished(
@@ -88,8 +80,7 @@ def without(
     fits = []
     for effect in problem.effects:
         if effect.name in best and effect.kind == "mean":
-            x = trials[effect.name].x.copy()
-            x[problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)] = nulls(effect)
+            x = _at_null(problem, trials[effect.name].x, [effect.name])
             fits.append(fitting.fit(problem, x, before.effects, spread=before.spread))
     found = max(fits, key=lambda f: f.log_evidence, default=before)
     return polish(problem, found) if found.log_evidence > before.log_evidence + _BETTER else None
@@ -113,7 +104,7 @@ def starting_points(
         return []
     index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
     scale, sided = scales(effect), sides(effect)
-    x = _at_its_place(problem, x, effect)
+    x = _at_null(problem, x, [effect.name])
     one_step = x.copy()
     if step is not None:
         moved = np.clip(step, -4 * scale, 4 * scale)
@@ -176,9 +167,12 @@ def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[
 
 def at_null_except(problem: Problem, fitted: fitting.Fit, kept: Sequence[str]) -> np.ndarray:
     """The point of a fit with all its effects but those kept back at their null."""
-    x, null = fitted.x.copy(), problem.null()
-    for name in fitted.effects:
-        if name not in kept:
-            for block in problem.blocks_of(name):
-                x[block.index] = null[block.index]
+    return _at_null(problem, fitted.x, [name for name in fitted.effects if name not in kept])
+
+
+def _at_null(problem: Problem, x: np.ndarray, names: Sequence[str]) -> np.ndarray:
+    """The point with some effects at their null, where they are now: a place may have moved since it was last tried."""
+    x, null = x.copy(), problem.null()
+    for block in (block for name in names for block in problem.blocks_of(name)):
+        x[block.index] = null[block.index]
     return x

@@ -101,7 +101,7 @@ def _predicted(problem: Problem, part: Fit, held: np.ndarray) -> _Predicted:
     noise = noise + np.einsum("cmi,cij,cmj->cm", pull, np.einsum("cki,ckj->cij", local, local), pull)
     variance = np.maximum(noise + (left**2).sum(-1), 0.0)
     return _Predicted(
-        e - np.einsum("cmi,ci->cm", pull, score), np.sqrt(variance), _swing(problem, part, unknown, held)
+        e - np.einsum("cmi,ci->cm", pull, score), np.sqrt(variance), _swing(problem, unknown, held)
     )
 
 
@@ -124,17 +124,13 @@ def _own(problem: Problem, part: Fit, active: Active) -> tuple[np.ndarray, np.nd
     return x, sd, ~base | (sd > 0).all(axis=0)
 
 
-def _swing(problem: Problem, part: Fit, unknown: np.ndarray, held: np.ndarray) -> np.ndarray:
+def _swing(problem: Problem, unknown: np.ndarray, held: np.ndarray) -> np.ndarray:
     """Standard deviation of the logarithm of the noise's own (held-out cluster, row), at rows of a location."""
     rows = np.zeros((problem.n_cluster, unknown.shape[1]))
     rows[held] = (unknown**2).sum(-1)
-    flat, start, found = problem.rows.unstack(rows), 0, {}
-    for name, observation in problem.compiled.observations(part.x).items():
-        count, shape = problem.components[name], problem.declaration.sites[name].shape
-        size = count * int(np.prod(shape, dtype=int))
-        own = flat[start : start + size].reshape(count, *shape)
-        start += size
-        scale, spread = LIKELIHOODS[observation.family].log_scale, problem.located[name]
+    found = {}
+    for name, own in problem.by_observation(rows).items():
+        scale, spread = LIKELIHOODS[problem.families[name]].log_scale, problem.located[name]
         swing = (
             np.zeros_like(own)
             if scale is None

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from scipy import sparse
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
@@ -25,6 +24,7 @@ from dtprob.gap.how_far.closed import ClosedFraction, Fold, HeldOut
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
 from dtprob.gap.view import View
+from dtprob.gap.where.curves import Curves
 from dtprob.gap.where.suspects import Suspect
 
 _TRIED, _TAKEN = 6, 3
@@ -279,23 +279,24 @@ def _step(suspect: Suspect, shape: tuple[int, ...], parts: int) -> Callable[[Any
     pattern, factor, spread = suspect.family.pattern, jnp.asarray(suspect.family.factor), suspect.spread
     kept = tuple(n if i in pattern.kept else 1 for i, n in enumerate(shape))
     curves = pattern.curves
-    values = None if curves is None else curves.values
-    spread_out = values.tocoo() if isinstance(values, sparse.csr_matrix) else None
-    dense = jnp.asarray(values) if isinstance(values, np.ndarray) else None
 
     def step(weights: Any) -> jax.Array:
         pair = spread * (weights if curves is None else weights.reshape(curves.extent[0], -1))
-        along = pair if dense is None else dense.T @ pair
-        if (
-            curves is not None and spread_out is not None
-        ):  # each position belongs to a few of very many weights
-            _, positions = curves.extent
-            own = spread_out.data[:, None] * pair[spread_out.row]
-            along = jnp.zeros((positions, pair.shape[1])).at[spread_out.col].add(own)
+        along = pair if curves is None else _along(curves, pair)
         along = along.reshape(*kept, parts)
         return factor * (along[..., 0] if parts == 1 else along[..., 0] + 1j * along[..., 1])
 
     return step
+
+
+def _along(curves: Curves, weights: jax.Array) -> jax.Array:
+    """What weights (weight, rest) of curves add up to, (position, rest)."""
+    if isinstance(curves.values, np.ndarray):
+        return jnp.asarray(curves.values).T @ weights
+    # of very many weights each position has a few
+    entries, (_, positions) = curves.values.tocoo(), curves.extent
+    added = entries.data[:, None] * weights[entries.row]
+    return jnp.zeros((positions, weights.shape[1])).at[entries.col].add(added)
 
 
 def _moved(value: jax.Array, step: jax.Array, *, positive: bool) -> jax.Array:

@@ -19,7 +19,7 @@ from numpyro import handlers
 from numpyro.distributions import constraints
 from numpyro.infer.reparam import LocScaleReparam
 
-from dtprob.models.declaration import Data, Model, base_constraint, split_static, trace_model
+from dtprob.models.declaration import Data, Model, base_constraint, innermost, split_static, trace_model
 
 _SCALED = {"loc", "scale"}
 
@@ -41,7 +41,7 @@ def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
         trace = trace_model(model, eqx.combine(arrays, static), key)
         found = {n: _way(trace[n]["fn"]) for n in shared}
         ways.update({n: way for n, way in found.items() if way is not None})
-        return {n: jnp.asarray(_inner(trace[n]["fn"]).scale) for n in ways}
+        return {n: jnp.asarray(innermost(trace[n]["fn"]).scale) for n in ways}
 
     jax.eval_shape(spreads, jax.random.key(0), arrays)
     if not ways:
@@ -62,15 +62,9 @@ def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
 
 def _way(fn: Any) -> LocScaleReparam | None:
     """How to draw from a distribution in standard units, where it has a location and a scale that something tells."""
-    names = set(_inner(fn).arg_constraints)
+    names = set(innermost(fn).arg_constraints)
     if not names >= _SCALED or base_constraint(fn.support) is not constraints.real:
         return None
-    if not isinstance(_inner(fn).scale, Tracer):
+    if not isinstance(innermost(fn).scale, Tracer):
         return None
     return LocScaleReparam(0.0, shape_params=sorted(names - _SCALED))
-
-
-def _inner(fn: Any) -> Any:
-    while hasattr(fn, "base_dist"):
-        fn = fn.base_dist
-    return fn

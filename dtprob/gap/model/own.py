@@ -121,12 +121,12 @@ def _belong(index: Int[np.ndarray, "cluster size"], x: np.ndarray, told: LogDens
     step = 0.1 * rng.standard_normal(index.shape)
     before, prior = told(x)
     rounding = _EXACT * np.finfo(before.dtype).eps
+    both = told(_moved(x, index, step, np.ones(len(index), bool)))[1]
     moves_any = False
     for moved in _halves(len(index), rng):
         likelihood, priors = zip(
             *(told(_moved(x, index, step, part)) for part in (moved, ~moved)), strict=True
         )
-        both = told(_moved(x, index, step, np.ones_like(moved)))[1]
         change = np.abs(np.where(moved, likelihood[1], likelihood[0]) - before)
         apart = abs(priors[0] + priors[1] - both - prior)
         alone = bool((change <= rounding * np.maximum(np.abs(before), 1.0)).all())

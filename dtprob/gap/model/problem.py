@@ -76,8 +76,7 @@ class Problem:
         self.own: dict[str, Own] = {}
         self.set_live(())
         self.own = own.of_latents(self)
-        if self.own:
-            self.set_live(())
+        self._lay_out()
         shared = self.declaration.latent.keys() - self.own.keys()
         drawn = model if reference is not None else decentred(model, data, shared)
         if drawn is not model:
@@ -86,7 +85,7 @@ class Problem:
         self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
             self.known = normal_of(self._reference_draws(reference))
-            self.set_live(())
+            self._lay_out()
 
     def _declare(self, model: Model, static: Any) -> None:
         self.model = model
@@ -95,7 +94,6 @@ class Problem:
 
     def set_live(self, live: tuple[Effect, ...]) -> None:
         """Index rows and coordinates for a set of live effects; nothing is compiled yet."""
-        self.__dict__.pop("compiled", None)
         self.live = live
         shapes, families = observed_shapes(self._declared, self.arrays, self.live)
         self.located = {n: whiten.location_rows(f, shapes[n][0]) for n, f in families.items()}
@@ -103,14 +101,20 @@ class Problem:
         self.rows: Rows = make_rows(
             self.declaration, shapes, self.located, self.data, self.column, joint=joint
         )
+        self._row_shapes, self._families = shapes, families
+        self._lay_out()
+
+    def _lay_out(self) -> None:
+        """Index coordinates anew, where only what clusters own or what is known has changed."""
+        self.__dict__.pop("compiled", None)
         self.layout: Layout = self._make_layout()
         self._runner = Runner(
             self._declared,
-            live,
+            self.live,
             self.layout,
             self.rows,
-            shapes,
-            families,
+            self._row_shapes,
+            self._families,
             self.own,
             frozenset(self.known),
         )
@@ -215,6 +219,16 @@ class Problem:
     def components(self) -> dict[str, int]:
         """Whitened rows per entry of each observed site."""
         return {name: shape[0] for name, shape in self._runner.shapes.items()}
+
+    def by_observation(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Rows (..., component, *site) of each observed site, from those of all (..., cluster, row)."""
+        flat, start, found = self.rows.unstack(rows), 0, dict[str, np.ndarray]()
+        for name, count in self.components.items():
+            site = self.declaration.observed[name]
+            stop = start + count * site.size
+            found[name] = flat[..., start:stop].reshape(*flat.shape[:-1], count, *site.shape)
+            start = stop
+        return found
 
     @property
     def families(self) -> Mapping[str, str]:

@@ -123,19 +123,6 @@ def place_energies(
     return jax.lax.map(one, points, batch_size=min(held, _PLACES))
 
 
-def _squares(
-    effect: Effect,
-    values: Mapping[str, jax.Array],
-    gradients: Mapping[str, jax.Array],
-    null: jax.Array,
-    context: Context,
-) -> Callable[[Mapping[str, jax.Array]], jax.Array]:
-    """The function from gradients at the sites of one data set to the squared scores of a field's entries."""
-    shape = effect.shape_of_field(values[effect.sites[0]], context)
-    _, pull = jax.vjp(_with_field(effect, values, gradients, null, context), jnp.zeros(shape))
-    return lambda gradient: pull(gradient)[0] ** 2
-
-
 def _with_field(
     effect: Effect,
     values: Mapping[str, jax.Array],
@@ -167,7 +154,10 @@ def field_energy(
     """Weighted sums of squared scores (n, weighting) of a field's entries, from gradients (n, *site)."""
     shape = effect.shape_of_field(values[effect.sites[0]], context)
     chosen = {site: gradients[site] for site in effect.rewrites if site in gradients}
-    square = _squares(effect, values, chosen, null, context)
+    _, pull = jax.vjp(_with_field(effect, values, chosen, null, context), jnp.zeros(shape))
+
+    def square(gradient: Mapping[str, jax.Array]) -> jax.Array:
+        return pull(gradient)[0] ** 2
 
     def add(total: jax.Array, gradient: Mapping[str, jax.Array]) -> tuple[jax.Array, None]:
         return total + square(gradient), None

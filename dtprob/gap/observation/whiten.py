@@ -117,16 +117,6 @@ def location_rows(family: str, n_rows: int) -> int:
     return n_rows if located is None else located
 
 
-def log_scale(family: str) -> float | None:
-    """Logarithm of the scale for a unit step of the first row that is no location; None unless the others are normal."""
-    return LIKELIHOODS[family].log_scale
-
-
-def is_outcome(family: str) -> bool:
-    """Whether one of a few outcomes is seen."""
-    return LIKELIHOODS[family].is_outcome
-
-
 def is_joint(family: str) -> bool:
     """Whether entries along the last axis are one vector, of which no entry stands alone."""
     return LIKELIHOODS[family].log_prob is not None

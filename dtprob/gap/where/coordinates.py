@@ -9,7 +9,7 @@ import numpy as np
 
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation import whiten
+from dtprob.gap.observation.likelihoods import LIKELIHOODS
 from dtprob.gap.tails import family_wise, gamma_tail
 
 
@@ -42,7 +42,7 @@ def scan_coordinates(
     blocks: list[tuple[str, int, int]] = []
     p, excess, maps = [], [], {}
     located = problem.rows.by_cluster(problem.rows.located) == 1
-    seen_as_outcomes = any(whiten.is_outcome(family) for family in problem.families.values())
+    seen_as_outcomes = any(LIKELIHOODS[family].is_outcome for family in problem.families.values())
     for axis, position in problem.rows.coordinates.items():
         index = np.where(located, problem.rows.by_cluster(position), -1)
         size = int(index.max()) + 1
@@ -58,7 +58,7 @@ def scan_coordinates(
         blocks += ((axis, *window) for window in zip(low.tolist(), high.tolist(), strict=True))
         tail = gamma_tail(inside, inside[1:].mean(0), inside[1:].var(0))[0]
         if seen_as_outcomes:
-            tail[0] = np.maximum(tail[0], _one_event(drawn.rows[0], index, energy[0], low, high))
+            tail[0] = np.maximum(tail[0], _one_event(drawn.rows[0], index, inside[0], low, high))
         p.append(tail)
         excess.append((inside[0] - inside[1:].mean(0)) / 2)
     if not blocks:
@@ -79,19 +79,19 @@ def _energy(rows: np.ndarray, index: np.ndarray, size: int) -> np.ndarray:
 
 
 def _one_event(
-    rows: np.ndarray, index: np.ndarray, energy: np.ndarray, low: np.ndarray, high: np.ndarray
+    rows: np.ndarray, index: np.ndarray, inside: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
     """Chance that a block holds one outcome as rare as its rarest, 0 where that makes less than half of its energy.
 
     A square of mean 1 reaches r^2 with a probability of 1 / r^2 at most (Markov), and an outcome as rare as this does.
     Replicates that never see it know nothing of its chance.
     """
-    largest, count = np.zeros(len(energy)), np.bincount(index[index >= 0], minlength=len(energy))
-    np.maximum.at(largest, index[index >= 0], rows[index >= 0] ** 2)
-    windows = list(zip(low.tolist(), (high + 1).tolist(), strict=True))
-    rarest = np.array([largest[a:b].max() for a, b in windows])
-    whole, n = (np.array([v[a:b].sum() for a, b in windows]) for v in (energy, count))
-    return np.where(2 * rarest > whole, np.minimum(n / np.maximum(rarest, 1e-300), 1.0), 0.0)
+    place, size = index[index >= 0], int(index.max()) + 1
+    largest, count = np.zeros(size), np.concatenate([[0], np.cumsum(np.bincount(place, minlength=size))])
+    np.maximum.at(largest, place, rows[index >= 0] ** 2)
+    rarest = np.array([largest[a:b].max() for a, b in zip(low.tolist(), (high + 1).tolist(), strict=True)])
+    n = count[high + 1] - count[low]
+    return np.where(2 * rarest > inside, np.minimum(n / np.maximum(rarest, 1e-300), 1.0), 0.0)
 
 
 def _windows(size: int, *, ordered: bool) -> Iterator[tuple[int, int]]:

@@ -20,7 +20,6 @@ from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
 from dtprob.gap.where.curves import columns, whole_columns
-from dtprob.gap.where.families import by_observation
 from dtprob.models.declaration import Site
 
 _FEWEST: Final = 4
@@ -98,7 +97,7 @@ def differences(problem: Problem, drawn: Replicates) -> tuple[Differences, ...]:
     if all(weight is None for weight in weights.values()):
         return ()
     found: list[Differences] = []
-    for name, rows in by_observation(problem, drawn.rows):
+    for name, rows in problem.by_observation(drawn.rows).items():
         site, weight = problem.declaration.observed[name], weights[name]
         if weight is None:
             continue

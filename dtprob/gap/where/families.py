@@ -138,19 +138,9 @@ def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients
     return Site(name, axes, grown, gradients, kinds)
 
 
-def by_observation(problem: Problem, rows: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    """The name of each observed site and its rows (n, component, *site), from those of all (n, cluster, row)."""
-    flat, start = problem.rows.unstack(rows), 0
-    for name, count in problem.components.items():
-        site = problem.declaration.observed[name]
-        stop = start + count * site.size
-        yield name, flat[:, start:stop].reshape(len(flat), count, *site.shape)
-        start = stop
-
-
 def observed(problem: Problem, rows: np.ndarray) -> Iterator[Site]:
     """Spreads of what is observed, from projected rows (n, cluster, row); locations too where the model names no site."""
-    for name, own in by_observation(problem, rows):
+    for name, own in problem.by_observation(rows).items():
         site, count = problem.declaration.observed[name], own.shape[1]
         located = problem.located[name]
         complex_parts = 2 if located == 2 < count else 1

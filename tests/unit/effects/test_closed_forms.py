@@ -402,6 +402,19 @@ def test_an_echo_off_any_point_differs_by_the_gain_of_each_link(world):
     np.testing.assert_allclose(ratio, np.broadcast_to(ratio[:, :1, :1, :1, :1], ratio.shape), rtol=1e-6)
 
 
+def test_an_echo_of_random_phase_hardly_turns_as_its_point_moves_by_half_a_wavelength(world):
+    anywhere = catalogue(world.sites, world.data, ["extra_path[anywhere]"])[0]
+    value, context = jnp.zeros((3, 1, 4, 3, 17), complex), {**world.data, **SHARED}
+    shape, half = anywhere.shape_of_field(value, context), world.data["paths"].wavelength / 2
+
+    def added(x):
+        given = {"scale": jnp.asarray(1.0), "field": jnp.ones(shape), "x": x, "y": -3.0, "z": 2.5}
+        return anywhere.rewrites["noiseless_channel"](value, given, context)
+
+    there = added(4.0)
+    assert np.abs(added(4.0 + half) - there).max() < 0.2 * np.abs(there).max()
+
+
 def test_places_off_which_an_echo_is_looked_for_cover_the_links(world):
     effect = catalogue(world.sites, world.data, ["extra_path[anywhere]"])[0]
     paths = world.data["paths"]

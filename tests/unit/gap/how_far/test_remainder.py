@@ -144,46 +144,46 @@ def log(window, y=None):
         numpyro.sample("y", dist.Normal(load, 1.0), obs=y)
 
 
+def moved_as_its_families_do(problem, site, over, rng):
+    """Labels of all families of a site, each of whose fields moves the site as the family's weights do."""
+    seen, value = [], site.value
+    for family, scores in families(partial(curves, problem), over, site):
+        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0), positive=False)
+        weights = rng.normal(size=effect.shape_of_field(jnp.asarray(value), {}))
+        moved = effect.rewrites["load"](value, {"scale": 2.0, FIELD: weights}, {}) - value
+        assert weights.size == scores.shape[1]
+        wanted = family.pattern.perturbation(weights.reshape(-1), value.shape, 1)[..., 0] * family.factor
+        np.testing.assert_allclose(moved, np.broadcast_to(wanted, value.shape), atol=1e-12)
+        seen.append(family.pattern.label)
+    return seen
+
+
 def test_a_field_moves_its_site_as_its_family_does():
     rng = np.random.default_rng(0)
     problem = Problem(log, {"window": np.arange(21) // 3, "y": rng.normal(size=(21, 8, 2))}, [], "window")
     value = rng.normal(size=(21, 8, 2))
     site = deterministic("load", ("window", "slot", "device"), value, rng.normal(size=(1, 21, 8, 2)))
-    seen = []
     over = quantity("delay", site.axes, rng.normal(size=value.shape))
-    for family, scores in families(partial(curves, problem), [(over, tuple(over.curves()))], site):
-        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0), positive=False)
-        weights = rng.normal(size=effect.shape_of_field(jnp.asarray(value), {}))
-        moved = effect.rewrites["load"](value, {"scale": 2.0, FIELD: weights}, {}) - value
-        assert weights.size == scores.shape[1]
-        wanted = family.pattern.perturbation(weights.reshape(-1), value.shape, 1)[..., 0] * family.factor
-        np.testing.assert_allclose(moved, np.broadcast_to(wanted, value.shape), atol=1e-12)
-        seen.append(family.pattern.label)
+    seen = moved_as_its_families_do(problem, site, [(over, tuple(over.curves()))], rng)
     assert {"every 7 along window and slot", "along delay"} <= set(seen)
+
+
+def daily(place, y=None):
+    """A load on nine devices, day by day; each day has a place."""
+    del place
+    level = numpyro.sample("level", dist.Normal(0.0, 3.0))
+    with numpyro.plate("day", 12, dim=-2), numpyro.plate("device", 9):
+        load = numpyro.deterministic("load", jnp.broadcast_to(level, (12, 9)))
+        numpyro.sample("y", dist.Normal(load, 1.0), obs=y)
 
 
 def test_stretches_and_columns_of_each_device_move_their_site_too():
     """Windows overlap, so that a position belongs to several weights."""
-
-    def daily(place, y=None):
-        del place
-        level = numpyro.sample("level", dist.Normal(0.0, 3.0))
-        with numpyro.plate("day", 12, dim=-2), numpyro.plate("device", 9):
-            load = numpyro.deterministic("load", jnp.broadcast_to(level, (12, 9)))
-            numpyro.sample("y", dist.Normal(load, 1.0), obs=y)
-
     rng = np.random.default_rng(1)
     value = rng.normal(size=(12, 9))
     problem = Problem(daily, {"place": rng.normal(size=12), "y": value}, [], "day")
-    site, seen = deterministic("load", ("day", "device"), value, rng.normal(size=(1, 12, 9))), []
-    for family, scores in families(partial(curves, problem), [], site):
-        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0), positive=False)
-        weights = rng.normal(size=effect.shape_of_field(jnp.asarray(value), {}))
-        moved = effect.rewrites["load"](value, {"scale": 2.0, FIELD: weights}, {}) - value
-        assert weights.size == scores.shape[1]
-        wanted = family.pattern.perturbation(weights.reshape(-1), value.shape, 1)[..., 0] * family.factor
-        np.testing.assert_allclose(moved, np.broadcast_to(wanted, value.shape), atol=1e-12)
-        seen.append(family.pattern.label)
+    site = deterministic("load", ("day", "device"), value, rng.normal(size=(1, 12, 9)))
+    seen = moved_as_its_families_do(problem, site, [], rng)
     assert {"stretch of device x day", "along place x device"} <= set(seen)
 
 

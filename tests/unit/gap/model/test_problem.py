@@ -241,3 +241,11 @@ def test_an_absent_site_is_named():
     lost = Effect("lost", {"gain": lambda v, p, c: v + p["c"]}, (Parameter("c", dist.Normal(0.0, 1.0)),))
     with pytest.raises(InputError, match=r"effect lost.*level, b, slope, mean|effect lost"):
         Problem(line, draw("line"), [lost, ripple()])
+
+
+def test_an_effect_that_looks_at_its_own_site_is_refused_before_anything_is_fitted():
+    rewrite = {"mean": lambda value, p, context: value + p["size"] * context["mean"]}
+    greedy = Effect("greedy", rewrite, (Parameter("size", dist.Normal()),))
+    problem = Problem(line, draw("line"), [greedy])
+    with pytest.raises(InputError, match=r"effect greedy.*its own site, which is its first argument"):
+        _ = problem.float_sites

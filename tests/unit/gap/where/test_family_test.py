@@ -58,3 +58,14 @@ def test_rare_outcomes_are_judged_by_their_sum():
         assert found.null.min() > 1e-5
     assert 0.2 < np.median(values) < 0.8
     assert (np.array(values) < 0.02).sum() <= stats.binom.isf(1e-3, 60, 0.04)
+
+
+def test_a_few_entries_of_heavy_tails_do_not_hide_the_one_that_is_wrong():
+    found = []
+    for seed in range(10):
+        rng = np.random.default_rng(seed)
+        scores = rng.standard_normal((100, 300))
+        scores[:, :20] = rng.standard_t(2, (100, 20))
+        scores[0, :20], scores[0, 123] = 0.0, 6.5
+        found.append(family_test(FAMILY, scores).p_value)
+    assert np.median(found) < 1e-3

@@ -13,6 +13,7 @@ from dtprob.errors import InputError
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bootstrap import replicate
 from dtprob.gap.fitting.projection import project
+from dtprob.gap.fitting.refit import refit
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import view
@@ -20,6 +21,7 @@ from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.directions import surroundings
 from dtprob.gap.which.places import place
 from dtprob.gap.which.screen import screen
+from dtprob.gap.which.search import search
 from dtprob.gap.which.trials import tried
 from dtprob.inference.laplace import Laplace
 from tests.unit.gap.examples import PLACES, WIDTH, bump, draw, gusty, inputs, line, raised, ripple
@@ -125,6 +127,41 @@ def test_a_random_field_is_found_and_fitted_at_its_place(looked):
     assert set(sizes) == {"height", "at"}
     assert sizes["height"].low < heights.std() < sizes["height"].high
     assert sizes["at"].low < fitted.x[at] < sizes["at"].high
+
+
+def test_a_random_field_is_fitted_from_where_it_was_found_last(looked):
+    """Tried at -1.7 before, found at 0.4 since."""
+    heights = 1.5 * np.random.default_rng(5).normal(size=(len(inputs()), 1))
+    shift = heights * raised(inputs(), 0.4, 1.0)
+    height, at = gusty().parameters
+    found = replace(gusty(), parameters=(height, replace(at, null=0.4)))
+    problem, base, _, _ = looked(shift, of=Problem(line, draw("line"), [found]))
+    live = problem.with_live(["gusty"])
+    x = live.translate(base.x, problem)
+    position = live.layout["gusty.at"].offset
+    x[position] = -1.7
+    fitted = refit(live, replace(base, x=x), found, [])
+    assert abs(fitted.x[position] - 0.4) < 0.2 * WIDTH
+
+
+def test_a_random_field_pays_for_its_place(looked):
+    problem, base, projection, drawn = looked(of=Problem(line, draw("line"), [gusty()]))
+    placed, found = place(problem, base, drawn)
+    seen, free = (screen(placed, base, projection, drawn, Settings(), placed=f) for f in (found, {}))
+    np.testing.assert_allclose(seen.p_value, found["gusty"].p_value)
+    np.testing.assert_array_equal(seen.replicate_p, found["gusty"].replicate_p)
+    np.testing.assert_allclose(free.log_bayes_factor - seen.log_bayes_factor, found["gusty"].price, rtol=1e-9)
+
+
+def test_a_random_field_with_a_place_imitates_nothing(looked):
+    """Where it was found the search does not start again without it."""
+    heights = 1.5 * np.random.default_rng(5).normal(size=(len(inputs()), 1))
+    of = Problem(line, draw("line"), [gusty(), ripple()])
+    problem, base, _, _ = looked(heights * raised(inputs(), 0.4, 1.0), of=of)
+    said = []
+    found = search(problem, base, jax.random.key(3), FAST, said.append)
+    assert found.steps[-1].end.fitted.effects == ("gusty",)
+    assert not any("imitated" in line for line in said)
 
 
 def test_a_random_field_is_not_found_where_there_is_none(looked):
