@@ -21,6 +21,8 @@ from dtprob.gap.which.trials import credit
 from dtprob.inference.engine import AbstractEngine
 
 _DRAWS = 200
+_TOLD = 0.01
+"""Probability up to which a site comes before those that have no more than a larger share."""
 _MOST_ALIKE = 300
 """Candidates up to which a report tells how much each looks like each."""
 
@@ -42,7 +44,9 @@ def compose(
         "gap": _gap(evidence),
         "unlisted": {
             "p_value": evidence.after.site_p_value,
-            "sites": [s.site for s in evidence.after.sites if s.p_value <= settings.level / 2],
+            "sites": list(
+                dict.fromkeys(s.site for s in evidence.after.sites if s.p_value <= settings.level / 2)
+            ),
         },
         "remainder": _remainder(evidence),
         "detectable": [
@@ -105,8 +109,11 @@ def _undecided(sets: Sequence[Sequence[str]]) -> str:
 
 
 def _place(found: SiteFinding) -> str:
-    """A site, or the spread of an observation, as text."""
-    return f"the spread of {found.site}" if found.family.startswith("spread") else found.site
+    """A site, or a moment of an observation, as text."""
+    if found.moment is None:
+        return found.site
+    what, _, whither = found.moment.partition(" ")
+    return f"the {what} of {found.site} {whither}".rstrip()
 
 
 def _tried(evidence: Evidence) -> list[dict[str, Any]]:
@@ -136,7 +143,9 @@ def _where(evidence: Evidence) -> dict[str, Any]:
     return {
         "sites": [
             {"site": s.site, "p_value": s.p_value, "share": shares[s.site], "family": s.family}
-            for s in sorted(evidence.before.sites, key=lambda s: (s.last, -shares[s.site], s.p_value))
+            for s in sorted(
+                evidence.before.sites, key=lambda s: (s.last, s.p_value > _TOLD, -shares[s.site], s.p_value)
+            )
         ],
         "coordinates": [
             {

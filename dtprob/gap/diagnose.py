@@ -20,6 +20,7 @@ from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
 from dtprob.gap.how_far.shares import shares
 from dtprob.gap.how_far.terms import error_db
+from dtprob.gap.model.nulls import check_nulls
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
@@ -64,7 +65,8 @@ def diagnose(
         say: receives one line at each stage, for progress.
 
     Raises:
-        InputError: no effects, effects on absent sites, fewer than four clusters, or a base model that does not fit.
+        InputError: no effects, effects on absent sites, effects that change the model at their null, fewer than four
+            clusters, or a base model that does not fit.
     """
     if not effects:
         raise InputError(
@@ -78,6 +80,7 @@ def diagnose(
             f"{problem.n_cluster} along {problem.cluster_name!r}",
             "Give more links, episodes or segments, or another cluster axis.",
         )
+    check_nulls(problem)
     evidence = _gather(problem, key, settings, say)
     causes = _causes(evidence, jax.random.fold_in(key, 7), engine, settings, say)
     verdict = decide(evidence, causes, settings)

@@ -17,6 +17,8 @@ from dtprob.report.units import (
     with_unit,
 )
 
+_MOMENTS: Final = ("spread", "skewness", "tails", "dependence")
+"""What of observations may be wrong where their values are right."""
 _CAPITALS = {
     "iq": "I/Q",
     "ack": "ACK",
@@ -68,9 +70,10 @@ def site_words(site: str) -> str:
 
 
 def located_words(site: Site) -> str:
-    """What of a site must change: its values, or the spread of what is observed there."""
-    spread = site.get("family", "").startswith("spread")
-    return f"spread of the {site_words(site['site'])}" if spread else site_words(site["site"])
+    """What of a site must change: its values, or a moment of what is observed there: `spread of the range`."""
+    what, _, whither = site.get("family", "").partition(",")[0].partition(" ")
+    values = site_words(site["site"])
+    return f"{what} of the {values} {words(whither)}".rstrip() if what in _MOMENTS else values
 
 
 def spoken(text: str, codes: Iterable[str]) -> str:

@@ -24,6 +24,8 @@ type Parameters = dict[str, jax.Array]
 
 EULER: Final = 0.5772156649015329
 _ROOT_TWO: Final = 2.0**0.5
+_NORMAL_FROM: Final = 3e3
+"""Degrees of freedom from which on the data tell nothing of their number."""
 
 
 def complex_normal_residual(p: Parameters, value: jax.Array) -> jax.Array:
@@ -79,20 +81,36 @@ def normal_shift(p: Parameters, t: Parameters) -> jax.Array:
 
 
 def student_residual(p: Parameters, value: jax.Array) -> jax.Array:
-    """Rows of a Student t distribution."""
+    """Rows of a Student t distribution: location, scale, and degrees of freedom where the scale is free."""
     v = p["df"]
     r = (value - p["loc"]) / p["scale"]
     weight = (v + 1) / (v + r**2)
     location = weight * r / jnp.sqrt((v + 1) / (v + 3))
-    scale = (weight * r**2 - 1.0) / jnp.sqrt(2 * v / (v + 3))
-    return jnp.stack([location, scale])
+    scale = weight * r**2 - 1.0
+    root, common, spread = _student_information(v)
+    w = jnp.minimum(v, _NORMAL_FROM)
+    heavier = (w + 1) / (w + r**2) * r**2
+    df = (digamma((w + 1) / 2) - digamma(w / 2) - 1 / w - jnp.log1p(r**2 / w) + heavier / w) / 2
+    return jnp.stack([location, scale / root, (df - common / root**2 * (heavier - 1.0)) / spread])
 
 
 def student_shift(p: Parameters, t: Parameters) -> jax.Array:
     """Shift of the rows of a Student t distribution."""
     v = p["df"]
-    location, scale = t["loc"] * jnp.sqrt((v + 1) / (v + 3)), t["scale"] * jnp.sqrt(2 * v / (v + 3))
-    return jnp.stack([location, scale]) / p["scale"]
+    root, common, spread = _student_information(v)
+    location, scale = t["loc"] * jnp.sqrt((v + 1) / (v + 3)) / p["scale"], t["scale"] * root / p["scale"]
+    return jnp.stack([location, scale + t["df"] * common / root, t["df"] * spread])
+
+
+def _student_information(v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Root of a Student t's information on the log scale, that on it and v, and the root of v's where the scale is free.
+
+    Source: Lange, Little and Taylor, Robust Statistical Modeling Using the t Distribution, JASA 84 (1989), appendix B.
+    """
+    v = jnp.minimum(v, _NORMAL_FROM)
+    scale, common = 2 * v / (v + 3), -2 / ((v + 1) * (v + 3))
+    own = (polygamma(1, v / 2) - polygamma(1, (v + 1) / 2)) / 4 - (v + 5) / (2 * v * (v + 1) * (v + 3))
+    return jnp.sqrt(scale), common, jnp.sqrt(own - common**2 / scale)
 
 
 def laplace_residual(p: Parameters, value: jax.Array) -> jax.Array:

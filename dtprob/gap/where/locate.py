@@ -26,6 +26,7 @@ from dtprob.gap.where.curves import Quantity, curves, groups, quantity, whole_co
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
+from dtprob.gap.where.moments import further_moments, moment
 from dtprob.gap.where.suspects import Suspect, suspects
 
 _SURE: Final = 0.005
@@ -49,7 +50,7 @@ class SiteFinding:
         family: what is added ("additive", "relative", "conjugate", "spread", ...) and how it varies.
         p_value: family-wise over all sites and families.
         gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order.
-        last: whether it is the spread of an observation where another site is surely wrong: a wrong mean spreads too.
+        last: whether it is a moment of an observation where another site is surely wrong: a wrong mean spreads too.
     """
 
     site: str
@@ -57,6 +58,11 @@ class SiteFinding:
     p_value: float
     gain: float
     last: bool = False
+
+    @property
+    def moment(self) -> str | None:
+        """What of an observation is wrong: its spread, or what lies beyond; None where values are."""
+        return moment(self.family)
 
 
 @dataclass(frozen=True)
@@ -104,7 +110,7 @@ def locate(
     for times, (low, high) in _further_looks(drawn, settings, shown=shown):
         if low < seen.p_value < high:
             seen = _test_sites(problem, fitted, projection, more(drawn, times), ways)
-    sure = {f.site for f in seen.findings if f.p_value <= _SURE}
+    sure = {f.site for f in seen.of_sites if f.p_value <= _SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
     entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
@@ -127,10 +133,16 @@ def _further_looks(
 
 
 class _Tested(NamedTuple):
-    """Every site with the tests of its families, and what they say."""
+    """Every site with the tests of its families, what they say in the same order, and what further moments say."""
 
     tested: list[tuple[Site, list[FamilyTest]]]
-    findings: list[SiteFinding]
+    of_sites: list[SiteFinding]
+    of_moments: list[SiteFinding]
+
+    @property
+    def findings(self) -> list[SiteFinding]:
+        """All of them."""
+        return self.of_sites + self.of_moments
 
     @property
     def p_value(self) -> float:
@@ -162,13 +174,16 @@ def _test_sites(
     tested = [
         (site, [family_test(*family) for family in families(ways.along, ways.over, site)]) for site in found
     ]
-    null = [test.null for _, tests in tested for test in tests]
+    beyond: dict[str, list[FamilyTest]] = {}
+    for name, family, scores in further_moments(problem, drawn.rows):
+        beyond.setdefault(name, []).append(family_test(family, scores))
+    null = [test.null for tests in (*(tests for _, tests in tested), *beyond.values()) for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
     findings = [
         _finding(problem, fitted, projection, drawn, site=site, tests=tests, smallest=smallest)
         for site, tests in tested
     ]
-    return _Tested(tested, findings)
+    return _Tested(tested, findings, [_beyond(name, tests, smallest) for name, tests in beyond.items()])
 
 
 def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
@@ -201,9 +216,16 @@ def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
 
 
 def _spreads_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
-    spread = [f.family.startswith("spread") for f in findings]
-    sure = any(f.p_value <= _SURE and not s for f, s in zip(findings, spread, strict=True))
-    return [replace(f, last=sure and s) for f, s in zip(findings, spread, strict=True)]
+    mean = [f.moment is None for f in findings]
+    sure = any(f.p_value <= _SURE and m for f, m in zip(findings, mean, strict=True))
+    return [replace(f, last=sure and not m) for f, m in zip(findings, mean, strict=True)]
+
+
+def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> SiteFinding:
+    """The further moment of an observation with the smallest p-value; nothing that a fit could move stands for it."""
+    best = min(tests, key=lambda test: test.p_value)
+    p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
+    return SiteFinding(name, best.family.label, p_value, 0.0)
 
 
 def _finding(

@@ -47,7 +47,7 @@ FAMILIES = {
     "StudentT": (
         lambda loc, scale, df: dist.StudentT(df, loc, scale),
         {"loc": strong(-0.3), "scale": strong(0.6), "df": strong(5.0)},
-        {"loc": strong(0.7), "scale": strong(0.4), "df": strong(0.0)},
+        {"loc": strong(0.7), "scale": strong(0.4), "df": strong(1.5)},
     ),
     "BernoulliLogits": (
         lambda logits: dist.Bernoulli(logits=logits),

@@ -1,0 +1,36 @@
+"""Effects that change the model where they should do nothing are refused; those that do nothing are not."""
+
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.errors import InputError
+from dtprob.gap.model.nulls import check_nulls
+from dtprob.gap.model.problem import Problem
+from tests.unit.gap.examples import bend, bump, draw, gusty, line
+
+
+def scaled(null):
+    return Effect(
+        "scaled",
+        {"mean": lambda value, p, c: value * p["by"]},
+        (Parameter("by", dist.LogNormal(0.0, 0.3), null=null),),
+    )
+
+
+def test_an_effect_that_changes_the_model_at_its_null_is_refused():
+    problem = Problem(line, draw("line"), [bend(), scaled(0.0)])
+    with pytest.raises(
+        InputError, match=r"effect scaled: expected site 'mean' unchanged at its null, by = 0.0"
+    ):
+        check_nulls(problem)
+
+
+def test_a_constant_that_is_always_added_is_refused():
+    lifted = Effect("lifted", {"mean": lambda v, p, c: v + 0.01 + p["c"]}, (Parameter("c", dist.Normal()),))
+    with pytest.raises(InputError, match="effect lifted"):
+        check_nulls(Problem(line, draw("line"), [lifted]))
+
+
+def test_effects_that_do_nothing_there_pass():
+    check_nulls(Problem(line, draw("line"), [bend(), bump(), gusty(), scaled(1.0)]))

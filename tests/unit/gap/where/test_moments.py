@@ -1,0 +1,146 @@
+"""Skewness, tails and dependence of observations: noticed and named where they are there, silent where they are not."""
+
+import contextlib
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from scipy import stats
+
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.bootstrap import more, replicate
+from dtprob.gap.fitting.projection import project
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.gap.where.family_test import family_test
+from dtprob.gap.where.locate import locate
+from dtprob.gap.where.moments import further_moments, moment, skewness, tails
+from dtprob.models.declaration import model
+
+LINKS, TIMES, OUTPUTS = 30, 20, 3
+SHAPE = (LINKS, TIMES, OUTPUTS)
+AXES = ("link", "time", "output")
+
+
+@model(cluster="link", axes={"expected": AXES, "y": AXES, "z": AXES})
+def two(load, y=None, z=None):
+    """Two things seen of one load, with unknown slope, levels and noise."""
+    slope = numpyro.sample("slope", dist.Normal(0.0, 10.0))
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0).expand([2]).to_event(1))
+    noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0).expand([2]).to_event(1))
+    numpyro.deterministic("expected", level[0] + slope * load)
+    plates = (numpyro.plate(axis, n, dim=i - 3) for i, (axis, n) in enumerate(zip(AXES, SHAPE, strict=True)))
+    with contextlib.ExitStack() as stack:
+        for plate in plates:
+            stack.enter_context(plate)
+        numpyro.sample("y", dist.Normal(level[0] + slope * load, noise[0]), obs=y)
+        numpyro.sample("z", dist.LogNormal(level[1] - slope * load, noise[1]), obs=z)
+
+
+def replicated(noise):
+    """Fit and replicates at data with this noise (y or z, link, time, output), of unit variance where the twin is right."""
+    load = np.random.default_rng(99).normal(size=SHAPE)
+    data = {
+        "load": load,
+        "y": 2.0 + 0.7 * load + 0.5 * noise[0],
+        "z": np.exp(1.0 - 0.7 * load + 0.3 * noise[1]),
+    }
+    problem = Problem(two, {name: jnp.asarray(value) for name, value in data.items()}, [])
+    fitted = fitting.fit(problem, problem.null())
+    projection = project(problem, fitted)
+    settings = Settings()
+    drawn = replicate(problem, fitted, projection, jax.random.key(0), settings)
+    return problem, fitted, projection, drawn, settings
+
+
+def normal(seed):
+    return np.random.default_rng(seed).normal(size=(2, *SHAPE))
+
+
+def skewed(seed):
+    noise = normal(seed)
+    noise[0] = (np.random.default_rng(seed + 50).gamma(4.0, size=SHAPE) - 4.0) / 2.0
+    return noise
+
+
+def heavy(seed):
+    noise = normal(seed)
+    noise[1] = np.random.default_rng(seed + 50).standard_t(5, size=SHAPE) / np.sqrt(5 / 3)
+    return noise
+
+
+def remembered(seed):
+    noise = normal(seed)
+    for t in range(1, TIMES):
+        noise[0, :, t] = 0.3 * noise[0, :, t - 1] + np.sqrt(1 - 0.3**2) * noise[0, :, t]
+    return noise
+
+
+def across(seed):
+    noise = normal(seed)
+    noise[1, ..., 2] = 0.4 * noise[1, ..., 0] + np.sqrt(1 - 0.4**2) * noise[1, ..., 2]
+    return noise
+
+
+def shared(seed):
+    noise = normal(seed)
+    noise[1] = 0.3 * noise[0] + np.sqrt(1 - 0.3**2) * noise[1]
+    return noise
+
+
+@pytest.mark.parametrize(
+    ("noise", "site", "expected"),
+    [
+        (skewed, "y", "skewness"),
+        (heavy, "z", "tails"),
+        (remembered, "y", "dependence along time"),
+        (across, "z", "dependence from output to output"),
+        (shared, "y", "dependence on z"),
+    ],
+)
+def test_what_is_wrong_with_the_noise_is_named(noise, site, expected):
+    first = locate(*replicated(noise(3))).sites[0]
+    assert (first.site, first.moment) == (site, expected)
+    assert first.p_value < 1e-4
+
+
+def test_nothing_is_noticed_where_nothing_is_wrong():
+    """Each of some hundred other replicates taken as the data: no more small p-values than chance lets there be."""
+    problem, _, _, drawn, _ = replicated(normal(0))
+    rows = more(drawn, 4).rows[1:]
+    null, data = rows[:99], rows[99:249]
+    assert len(data) == 150
+    p = {}
+    for row in data:
+        for name, family, scores in further_moments(problem, np.concatenate([row[None], null])):
+            p.setdefault((name, family.label), []).append(family_test(family, scores).p_value)
+    assert len(p) == 2 * 6 * 4 + 4
+    for values in p.values():
+        for level in (0.01, 0.1):
+            assert (np.array(values) <= level).sum() <= stats.binom.isf(
+                1e-3 / len(p), len(values), 1.3 * level
+            )
+
+
+def test_values_and_moments_are_told_apart():
+    assert moment("dependence along link, common") == "dependence along link"
+    assert moment("spread, by weekday") == "spread"
+    assert moment("relative, smooth in link") is None
+
+
+@pytest.mark.parametrize("shape", [skewness, tails])
+def test_what_a_mean_or_a_scale_moves_does_not_count(shape):
+    at, weight = np.polynomial.hermite_e.hermegauss(150)
+    weight /= weight.sum()
+    for moved in (1.0, at, at**2 - 1.0):
+        assert abs(np.sum(weight * moved * shape(at))) < 1e-6
+
+
+def test_shapes_have_the_sign_that_they_say():
+    rng = np.random.default_rng(2)
+    right = (rng.gamma(4.0, size=100_000) - 4.0) / 2.0
+    assert abs(skewness(right).mean() + skewness(-right).mean()) < 1e-12
+    assert tails(rng.standard_t(5, size=100_000) / np.sqrt(5 / 3)).mean() * tails(np.zeros(1))[0] > 0
