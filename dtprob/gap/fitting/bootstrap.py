@@ -106,6 +106,19 @@ def more(drawn: Replicates, times: int) -> Replicates:
     return replace(drawn, rows=np.concatenate([observed, projected]), gradients=gradients)
 
 
+def normal_like(drawn: Replicates) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """Normal projected rows (replicate, cluster, row) of the replicates' covariance, as many as these, and site gradients.
+
+    Rare outcomes may be seen by no replicate; in these they have their share.
+    """
+    key = jax.random.fold_in(drawn.keys[0], 1)
+    keys = jax.random.split(key, drawn.at_sites)
+    rows = np.asarray(jax.random.normal(key, (drawn.at_sites, *drawn.raw.shape)))
+    projected = drawn.projection.rows(drawn.projection.with_prior(rows, keys))
+    found = drawn.problem.compiled.site_gradient(drawn.fitted.x, np.concatenate([drawn.rows[:1], projected]))
+    return projected, {name: np.asarray(g)[1:] for name, g in found.items()}
+
+
 def _projected(problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array) -> np.ndarray:
     parts = _portions(problem, fitted, projection, keys)
     return np.concatenate([projection.rows(rows) for rows, _ in parts])

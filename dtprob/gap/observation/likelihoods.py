@@ -286,3 +286,9 @@ SAME: Final[Mapping[str, str]] = {
     "Chi2": "Gamma",
 }
 """Classes that are another one with parameters of their own, which they turn into its."""
+
+
+def is_discrete(family: str) -> bool:
+    """Whether outcomes or counts are observed."""
+    known = getattr(dist, family, None)
+    return known is not None and bool(known.support.is_discrete)

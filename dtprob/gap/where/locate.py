@@ -15,16 +15,17 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from dtprob.gap.fitting.bootstrap import Replicates, more
+from dtprob.gap.fitting.bootstrap import Replicates, more, normal_like
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.where.curves import Quantity, curves, groups, quantity, whole_columns
 from dtprob.gap.where.differences import Differences, differences
-from dtprob.gap.where.families import Along, Over, Site, deterministic, families, observed, shifted
+from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.moments import further_moments, moment
 from dtprob.gap.where.suspects import Suspect, suspects
@@ -34,7 +35,7 @@ _SURE: Final = 0.005
 _MORE: Final = 400
 """Replicates of a second look at the sites, at least; a third one takes all that the settings allow."""
 _OPEN_AT_FIRST: Final = (1e-9, 0.1)
-"""Between these, a first look does not tell on which side of the level a gap lies."""
+"""Between these, a first look does not tell on which side of the level a gap lies; of outcomes and counts not below."""
 _OPEN_WHERE_SHOWN: Final = (1e-6, 0.1)
 """The same where the effects' scores show the gap, and the sites say mostly where it lies."""
 _OPEN_AT_SECOND: Final = (0.01, 10.0)
@@ -105,9 +106,9 @@ def locate(
         shown: whether the effects' scores show a gap already.
     """
     blocks, maps = scan_coordinates(problem, drawn)
-    ways = _ways(problem, projection.origin)  # what was fitted to these data would agree with them
+    ways = _ways(problem, projection.origin, drawn)  # what was fitted to these data would agree with them
     seen = _test_sites(problem, fitted, projection, drawn, ways)
-    for times, (low, high) in _further_looks(drawn, settings, shown=shown):
+    for times, (low, high) in _further_looks(drawn, settings, shown=shown, discrete=ways.normal is not None):
         if low < seen.p_value < high:
             seen = _test_sites(problem, fitted, projection, more(drawn, times), ways)
     sure = {f.site for f in seen.of_sites if f.p_value <= _SURE}
@@ -120,13 +121,14 @@ def locate(
 
 
 def _further_looks(
-    drawn: Replicates, settings: Settings, *, shown: bool
+    drawn: Replicates, settings: Settings, *, shown: bool, discrete: bool
 ) -> Iterator[tuple[int, tuple[float, float]]]:
     """How many times more replicates another look takes, and between which p-values of the look before it is taken."""
     most = drawn.most(settings.site_times)
     second = min(math.ceil(_MORE / max(drawn.at_sites, 1)), most)
     if second > 1:
-        yield second, _OPEN_WHERE_SHOWN if shown else _OPEN_AT_FIRST
+        low, high = _OPEN_WHERE_SHOWN if shown else _OPEN_AT_FIRST
+        yield second, (0.0 if discrete else low, high)
     if most > second:
         low, high = _OPEN_AT_SECOND
         yield most, (low * settings.level / 2, high * settings.level / 2)
@@ -151,29 +153,46 @@ class _Tested(NamedTuple):
 
 
 class _Ways(NamedTuple):
-    """The values of sites, and how they may be wrong, whatever the replicates: along their axes, and over quantities."""
+    """How sites may be wrong, whatever the replicates.
+
+    Attributes:
+        values: of the sites.
+        along: curves along their axes.
+        over: curves over quantities.
+        normal: normal rows and site gradients, of the replicates' covariance, of outcomes and counts; else None.
+    """
 
     values: Mapping[str, np.ndarray]
     along: Along
     over: Over
+    normal: tuple[np.ndarray, Mapping[str, np.ndarray]] | None
 
 
-def _ways(problem: Problem, x: np.ndarray) -> _Ways:
+def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
     at = problem.compiled.sites(x)
     values = {n: np.broadcast_to(np.asarray(at[n]), grown.shape) for n, grown in problem.float_sites.items()}
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    return _Ways(values, along, [(q, tuple(q.curves())) for q in _quantities(problem, values)])
+    over = [(q, tuple(q.curves())) for q in _quantities(problem, values)]
+    discrete = any(is_discrete(family) for family in problem.families.values())
+    return _Ways(values, along, over, normal_like(drawn) if discrete else None)
 
 
 def _test_sites(
     problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, ways: _Ways
 ) -> _Tested:
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
-    found = [deterministic(n, axes[n], ways.values[n], np.asarray(g)) for n, g in drawn.gradients.items()]
-    found += observed(problem, drawn.rows)
-    tested = [
-        (site, [family_test(*family) for family in families(ways.along, ways.over, site)]) for site in found
-    ]
+    rows, gradients = drawn.rows, {n: np.asarray(g) for n, g in drawn.gradients.items()}
+    if ways.normal is not None:
+        rows = np.concatenate([rows, ways.normal[0]])
+        gradients = {n: np.concatenate([g, ways.normal[1][n]]) for n, g in gradients.items()}
+    found = [deterministic(n, axes[n], ways.values[n], g) for n, g in gradients.items()]
+    found += observed(problem, rows)
+
+    def test(family: Family, scores: np.ndarray) -> FamilyTest:
+        own, normal = np.split(scores, [len(drawn.rows)])
+        return family_test(family, own, normal if len(normal) else None)
+
+    tested = [(site, [test(*family) for family in families(ways.along, ways.over, site)]) for site in found]
     beyond: dict[str, list[FamilyTest]] = {}
     for name, family, scores in further_moments(problem, drawn.rows):
         beyond.setdefault(name, []).append(family_test(family, scores))

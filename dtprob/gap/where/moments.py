@@ -21,6 +21,8 @@ from dtprob.gap.where.families import Family, Pattern
 
 _MOST: Final = 1 << 16
 """Entries of an observation up to which it is looked at."""
+_HEAVIEST: Final = 4.0
+"""Kurtosis over replicates up to which a sum of products of outcomes is looked at; 3 of a normal one."""
 _OUTPUTS: Final = 8
 """Entries of a last axis up to which each pair is looked at."""
 _ODD: Final = math.sqrt(3.0 / math.pi)
@@ -38,31 +40,43 @@ def moment(family: str) -> str | None:
 
 
 def further_moments(problem: Problem, rows: np.ndarray) -> Iterator[tuple[str, Family, np.ndarray]]:
-    """Each observation that is no outcome, what of it is looked at, how that is pooled, and its scores (n, entry).
+    """Each observation, what of it is looked at, how that is pooled, and its scores (n, entry).
 
     Args:
         problem: the model and candidates on their data.
         rows: projected ones (n, cluster, row), of the data first.
     """
     looked = {
-        name: own[:, 0]
+        name: own[:, : problem.located[name]]
         for name, own in problem.by_observation(rows).items()
-        if problem.located[name] == 1
-        and not LIKELIHOODS[problem.families[name]].is_outcome
-        and own[0, 0].size <= _MOST
+        if problem.located[name] == 1 or LIKELIHOODS[problem.families[name]].is_outcome
+        if own[0].size <= _MOST
     }
     for name, row in looked.items():
-        axes = problem.declaration.observed[name].axes
+        axes, known = problem.declaration.observed[name].axes, LIKELIHOODS[problem.families[name]]
         others = {
             n: r for n, r in looked.items() if n > name and problem.declaration.observed[n].axes == axes
         }
-        normal = LIKELIHOODS[problem.families[name]].log_scale is not None
-        for kind, values in (*(_shape(row) if normal else ()), *_dependence(row, axes, others)):
-            centred = values - values[1:].mean(axis=0)
+        shape = _shape(row[:, 0]) if known.log_scale is not None else ()
+        for kind, values in (*shape, *_dependence(row, axes, others)):
             for kept in ((), *((i,) for i in range(len(axes)) if values.shape[1 + i] > 1)):
-                rest = tuple(1 + i for i in range(values.ndim - 1) if i not in kept)
-                pattern = Pattern(axes[kept[0]] if kept else "common", kept)
-                yield name, Family(kind, pattern, np.ones(())), centred.sum(rest).reshape(len(values), -1)
+                scores = _pooled(values, kept)
+                if not known.is_outcome or _is_near_normal(scores[1:]):
+                    pattern = Pattern(axes[kept[0]] if kept else "common", kept)
+                    yield name, Family(kind, pattern, np.ones(())), scores
+
+
+def _pooled(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
+    """Values (n, *entry) less what replicates have at the mean, summed over all axes but those kept."""
+    centred = values - values[1:].mean(axis=0)
+    rest = tuple(1 + i for i in range(values.ndim - 1) if i not in kept)
+    return centred.sum(rest).reshape(len(values), -1)
+
+
+def _is_near_normal(scores: np.ndarray) -> bool:
+    """Whether sums of rare coincidences vary over replicates (n, entry) as sums of many do, for all entries."""
+    square = np.maximum((scores**2).mean(axis=0), 1e-300)
+    return bool(np.all((scores**4).mean(axis=0) < _HEAVIEST * square**2))
 
 
 def _shape(row: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
@@ -73,16 +87,18 @@ def _shape(row: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
 def _dependence(
     row: np.ndarray, axes: tuple[str, ...], others: dict[str, np.ndarray]
 ) -> Iterator[tuple[str, np.ndarray]]:
+    """Products of rows (n, component, *entry), summed over the components."""
     for i, axis in enumerate(axes):
-        if (n := row.shape[1 + i]) > 2:
-            ahead, behind = np.take(row, range(1, n), 1 + i), np.take(row, range(n - 1), 1 + i)
-            yield f"dependence along {axis}", ahead * behind
-    if 1 < row.shape[-1] <= _OUTPUTS and row.ndim > 2:
-        pairs = [row[..., a] * row[..., b] for a, b in itertools.combinations(range(row.shape[-1]), 2)]
-        yield f"dependence from {axes[-1]} to {axes[-1]}", np.stack(pairs, axis=-1)
+        if (n := row.shape[2 + i]) > 2:
+            ahead, behind = np.take(row, range(1, n), 2 + i), np.take(row, range(n - 1), 2 + i)
+            yield f"dependence along {axis}", (ahead * behind).sum(1)
+    if 1 < row.shape[-1] <= _OUTPUTS and len(axes) > 1:
+        pairs = itertools.combinations(range(row.shape[-1]), 2)
+        together = np.stack([(row[..., a] * row[..., b]).sum(1) for a, b in pairs], axis=-1)
+        yield f"dependence from {axes[-1]} to {axes[-1]}", together
     for name, other in others.items():
         if other.shape == row.shape:
-            yield f"dependence on {name}", row * other
+            yield f"dependence on {name}", (row * other).sum(1)
 
 
 def skewness(row: np.ndarray) -> np.ndarray:

@@ -69,3 +69,42 @@ def test_a_few_entries_of_heavy_tails_do_not_hide_the_one_that_is_wrong():
         scores[0, :20], scores[0, 123] = 0.0, 6.5
         found.append(family_test(FAMILY, scores).p_value)
     assert np.median(found) < 1e-3
+
+
+def outcomes(rng, chance, draws):
+    """Scores (draw, entry) of outcomes of these chances, each seen three times."""
+    return rng.binomial(3, chance, (draws, len(chance))) - 3 * chance
+
+
+def test_outcomes_that_no_replicate_has_are_not_told():
+    """One of 40 entries has a chance of .2%, and the data have it."""
+    chance = np.full(40, 0.3)
+    chance[7] = 0.002
+    without, within = [], []
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        scores = outcomes(rng, chance, 100)
+        scores[1:, 7] = -3 * chance[7] + 1e-4 * rng.normal(size=99)  # what fitted parameters add
+        scores[0, 7] = 1 - 3 * chance[7]
+        normal = rng.normal(size=(99, 40)) * np.sqrt(3 * chance * (1 - chance))
+        without.append(family_test(FAMILY, scores).p_value)
+        within.append(family_test(FAMILY, scores, normal).p_value)
+    assert max(without) < 1e-12
+    assert (np.array(within) < 0.02).sum() <= stats.binom.isf(1e-3, 30, 0.04)
+
+
+def test_one_rare_outcome_is_no_gap_and_many_are():
+    """Chances of .5%, which a replicate or two may have; three of a hundred data sets of the 20 entries have one."""
+    chance = np.concatenate([np.full(2, 0.005), np.full(18, 0.3)])
+    rare, common = [], []
+    for seed in range(100):
+        rng = np.random.default_rng(seed)
+        scores = outcomes(rng, chance, 100)
+        normal = rng.normal(size=(99, 20)) * np.sqrt(3 * chance * (1 - chance))
+        scores[0, 0] = 1 - 3 * chance[0]
+        rare.append(family_test(FAMILY, scores, normal).p_value)
+        scores[0, 5] = 3 - 3 * chance[5]
+        scores[0, 6:10] += 1.8
+        common.append(family_test(FAMILY, scores, normal).p_value)
+    assert min(rare) > 1e-4
+    assert np.median(common) < 1e-3

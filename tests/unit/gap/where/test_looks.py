@@ -9,9 +9,9 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.where.locate import _further_looks
 
 
-def looks(first, affordable, *, shown=False, **settings):
+def looks(first, affordable, *, shown=False, discrete=False, **settings):
     drawn = SimpleNamespace(at_sites=first, most=lambda times: min(times, affordable))
-    return list(_further_looks(cast("Any", drawn), Settings(**settings), shown=shown))
+    return list(_further_looks(cast("Any", drawn), Settings(**settings), shown=shown, discrete=discrete))
 
 
 def test_a_second_look_is_of_four_hundred_and_a_third_of_all():
@@ -24,6 +24,12 @@ def test_a_second_look_is_of_four_hundred_and_a_third_of_all():
 def test_where_a_gap_is_shown_the_first_look_mostly_suffices():
     (_, (low, _)), _ = looks(99, 1000, shown=True)
     assert low == 1e-6
+
+
+def test_outcomes_are_looked_at_again_however_surely_wrong_they_seem():
+    (_, (low, high)), (_, third) = looks(99, 1000, shown=True, discrete=True)
+    assert (low, high) == (0.0, 0.1)
+    assert third == pytest.approx((5e-5, 0.05))
 
 
 @pytest.mark.parametrize(
