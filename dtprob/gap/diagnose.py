@@ -108,8 +108,8 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     if last.fitted.effects:
         folds = list(closed.fold_fits(last.problem, last.fitted, assignment))
         held_after = closed.judged(last.problem, folds)
-    remains = last.location.site_p_value <= settings.level / 2
-    left = max((s.gain for s in last.location.sites), default=0.0) if remains else 0.0
+    wrong = [s for s in last.location.sites if s.p_value <= settings.level / 2]
+    remains, left = bool(wrong), max((s.gain for s in wrong), default=0.0)
     floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     fraction = (
         closed.closed_fraction(held_before, held_after, floor, keys[2]) if last.fitted.effects else None
