@@ -14,7 +14,7 @@ from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.terms import in_user_terms
 from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.locate import SiteFinding
+from dtprob.gap.where.locate import Location, SiteFinding
 from dtprob.gap.where.reach import touched
 from dtprob.gap.which.screen import Screening
 from dtprob.gap.which.trials import credit
@@ -23,6 +23,8 @@ from dtprob.inference.engine import AbstractEngine
 _DRAWS = 200
 _TOLD = 0.01
 """Probability up to which a site comes before those that have no more than a larger share."""
+_LEAST_GAP = 1.0
+"""Nats of a gap of which a site can have a share."""
 _MOST_ALIKE = 300
 """Candidates up to which a report tells how much each looks like each."""
 
@@ -42,12 +44,7 @@ def compose(
         "tried": _tried(evidence),
         "where": _where(evidence),
         "gap": _gap(evidence),
-        "unlisted": {
-            "p_value": evidence.after.site_p_value,
-            "sites": list(
-                dict.fromkeys(s.site for s in evidence.after.sites if s.p_value <= settings.level / 2)
-            ),
-        },
+        "unlisted": unlisted(evidence.after, settings.level / 2),
         "remainder": _remainder(evidence),
         "detectable": [
             {"effect": name, "size": size, "parameter": e.parameters[0].name, "unit": e.parameters[0].unit}
@@ -130,21 +127,50 @@ def _tried(evidence: Evidence) -> list[dict[str, Any]]:
     ]
 
 
+def unlisted(after: Location, level: float) -> dict[str, Any]:
+    """What is left over at the last fit: the sites at which it is, and how each of them is wrong."""
+    left = [found for found in after.sites if found.p_value <= level]
+    return {
+        "p_value": after.site_p_value,
+        "sites": list(dict.fromkeys(found.site for found in left)),
+        "located": [_located(found, None) for found in left],
+    }
+
+
+def site_shares(found: Sequence[SiteFinding], gap: float, closed: Mapping[str, float]) -> list[float | None]:
+    """The share of the gap that changing each site closes; None where there is no gap to share, or nothing to change.
+
+    Args:
+        found: the sites.
+        gap: nats between the twin and the best that is known.
+        closed: what the named effects close, for each site that they change.
+    """
+    return [
+        max(min(one.gain / gap, 1.0), closed.get(one.site, 0.0))
+        if one.gain is not None and gap >= _LEAST_GAP
+        else None
+        for one in found
+    ]
+
+
+def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:
+    return {"site": found.site, "p_value": found.p_value, "share": share, "family": found.family}
+
+
 def _where(evidence: Evidence) -> dict[str, Any]:
-    total = max(evidence.floor.best - float(evidence.held_before.log_likelihood.sum()), 1e-12)
+    gap = evidence.floor.best - float(evidence.held_before.log_likelihood.sum())
     coordinates = touched(evidence.steps[0].view, evidence.last)
     excess = sum(c.excess for c in coordinates) or 1.0
-    accepted = {e.name: e for e in evidence.problem.effects if e.name in evidence.accepted}
-    own = {site for e in accepted.values() for site in e.sites}
-    closed_share = evidence.fraction.mean if evidence.fraction is not None else 0.0
-    shares = {
-        s.site: max(min(s.gain / total, 1.0), closed_share * (s.site in own)) for s in evidence.before.sites
-    }
+    accepted = [e for e in evidence.problem.effects if e.name in evidence.accepted]
+    share = evidence.fraction.mean if evidence.fraction is not None else 0.0
+    closed = {site: share for effect in accepted for site in effect.sites}
+    before = evidence.before.sites
+    sites = zip(before, site_shares(before, gap, closed), strict=True)
     return {
         "sites": [
-            {"site": s.site, "p_value": s.p_value, "share": shares[s.site], "family": s.family}
-            for s in sorted(
-                evidence.before.sites, key=lambda s: (s.last, s.p_value > _TOLD, -shares[s.site], s.p_value)
+            _located(*one)
+            for one in sorted(
+                sites, key=lambda s: (s[0].last, s[0].p_value > _TOLD, -(s[1] or 0.0), s[0].p_value)
             )
         ],
         "coordinates": [

@@ -11,7 +11,7 @@ from dtprob.gap.fitting.bootstrap import replicate
 from dtprob.gap.fitting.projection import Projection, project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.locate import NOWHERE, Location, locate
+from dtprob.gap.where.locate import NOWHERE, Location, locate, most_gained
 from dtprob.gap.which.places import place
 from dtprob.gap.which.screen import Screening, screen
 
@@ -31,7 +31,7 @@ class View:
         """Nats that the best candidate or site could still bring, to first order."""
         return max(
             float(self.screening.log_bayes_factor.max(initial=0.0)),
-            max((s.gain for s in self.location.sites), default=0.0),
+            most_gained(self.location.sites),
         )
 
     def alarmed(self, settings: Settings) -> bool:

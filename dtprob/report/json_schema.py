@@ -120,10 +120,11 @@ class Gap(TypedDict):
 
 
 class Unlisted(TypedDict):
-    """The test for what is left after the accepted cause."""
+    """The test for what is left after the accepted cause; `located` says how each of the sites is wrong."""
 
     p_value: Probability | None
-    sites: list[str | Site]
+    sites: list[str]
+    located: NotRequired[list[Site]]
 
 
 class Term(TypedDict):

@@ -26,6 +26,10 @@ _CAPITALS = {
     "rx": "receive",
     "tx": "transmit",
     "rsrp": "RSRP",
+    "rss": "RSS",
+    "rssi": "RSSI",
+    "rtt": "RTT",
+    "sinr": "SINR",
     "snr": "SNR",
     "csi": "CSI",
 }
@@ -71,9 +75,15 @@ def site_words(site: str) -> str:
 
 def located_words(site: Site) -> str:
     """What of a site must change: its values, or a moment of what is observed there: `spread of the range`."""
-    what, _, whither = site.get("family", "").partition(",")[0].partition(" ")
+    what, _, whither = (moment(site) or "").partition(" ")
     values = site_words(site["site"])
-    return f"{what} of the {values} {words(whither)}".rstrip() if what in _MOMENTS else values
+    return " ".join([f"{what} of the {values}", *map(words, whither.split())]) if what else values
+
+
+def moment(site: Site) -> str | None:
+    """What of an observation is wrong where its values are right, as its family tells it."""
+    kind = site.get("family", "").partition(",")[0]
+    return kind if kind.split(" ")[0] in _MOMENTS else None
 
 
 def spoken(text: str, codes: Iterable[str]) -> str:

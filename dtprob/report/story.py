@@ -1,6 +1,6 @@
 """A verdict in plain words: what was found, what it means for the twin, what to do."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,6 +15,7 @@ from dtprob.report.names import (
     is_unchanged,
     listing,
     located_words,
+    moment,
     shares,
     significant,
     size_reading,
@@ -90,10 +91,16 @@ def next_look(report: Report) -> str:
         else ""
     )
     there = " there" if where else ""
-    what = f" Look for what could change the {located_words(left[0])}{there}." if left else ""
+    what = f" Look for what could {changed(left[:1])}{there}." if left else ""
     if not where and not what:
         return "No measurement is proposed."
     return f"No measurement tells unknown causes apart. Look again{where or ' at the data'}.{what}"
+
+
+def changed(sites: Sequence[Site]) -> str:
+    """`change the path delays and cause the dependence of the delay on RSS`."""
+    verbs = ("cause" if (moment(site) or "").startswith("dependence") else "change" for site in sites)
+    return listing(f"{verb} the {located_words(site)}" for verb, site in zip(verbs, sites, strict=True))
 
 
 def _saved(plan: Mapping[str, Any]) -> str:
@@ -117,12 +124,12 @@ def _codes(report: Report) -> set[str]:
     """All names of effects and sites that the report holds."""
     sets = [effects for cause in report["causes"] for effects in (cause["effects"], *cause["alias_class"])]
     screened = report.get("screening", [])
-    located = [*report["where"]["sites"], *report["unlisted"]["sites"]]
+    located = [*(site["site"] for site in report["where"]["sites"]), *report["unlisted"]["sites"]]
     return {
         *(effect for effects in sets for effect in effects),
         *(row["effect"] for row in screened),
         *(site for row in screened for site in row["sites"]),
-        *(site if isinstance(site, str) else site["site"] for site in located),
+        *located,
     }
 
 
@@ -185,14 +192,20 @@ def _remainder(report: Report) -> Story:
 
 
 def _unlisted(report: Report) -> Story:
+    left = left_over(report)
+    look = (
+        "Look for physics that the twin lacks where the gap lies, and declare it as a new effect."
+        if not left or any(moment(site) is None for site in left)
+        else "The values that the twin computes show nothing wrong; what it says of its errors does. Look for what "
+        f"could {changed(left[:2])}, or declare errors that are so."
+    )
     return Story(
         "Cause unknown",
         "unknown",
         "There is a gap, and none of the known effects explains it.",
         f"The difference between twin and data is real{_seat(report)}, but every effect in the library "
         "was tried, and something remains with each.",
-        "Do not add a listed effect: it would hide the problem, not solve it. Look for physics that the twin "
-        "lacks where the gap lies, and declare it as a new effect.",
+        f"Do not add a listed effect: it would hide the problem, not solve it. {look}",
     )
 
 
@@ -272,13 +285,10 @@ def _seat(report: Report) -> str:
 
 
 def left_over(report: Report) -> list[Site]:
-    """The sites at which something is left."""
-    known = {site["site"]: site for site in report["where"]["sites"]}
-    found: list[Site] = []
-    for site in report["unlisted"]["sites"]:
-        given: Site = {"site": site, "p_value": None, "share": None} if isinstance(site, str) else site
-        found.append({**given, "family": known.get(given["site"], given).get("family", "")})
-    return found
+    """The sites at which something is left, each once, as it is most surely wrong."""
+    names, located = report["unlisted"]["sites"], report["unlisted"].get("located", [])
+    first = {site["site"]: site for site in reversed(located)}
+    return [first.get(name, {"site": name, "p_value": None, "share": None}) for name in names]
 
 
 _COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}

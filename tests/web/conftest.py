@@ -194,7 +194,8 @@ def listed_with_remainder() -> dict[str, Any]:
         "verdict": "LISTED_WITH_REMAINDER",
         "unlisted": {
             "p_value": 2e-7,
-            "sites": [{"site": "rx_response", "p_value": 2e-7, "share": 0.3}],
+            "sites": ["rx_response"],
+            "located": [{"site": "rx_response", "p_value": 2e-7, "share": None, "family": "relative, link"}],
         },
     }
     report["gap"] |= {"after": 0.47, "in_user_terms": {"channel_nmse_db": [-3.1, -8.4]}}

@@ -265,7 +265,7 @@ def test_a_spread_is_called_a_spread(examples: dict[str, Any]) -> None:
         {"site": "noiseless_channel", "p_value": 1e-9, "share": 0.9, "family": "additive, link"},
         {"site": "channel", "p_value": 1e-9, "share": 0.9, "family": "spread, by link"},
     ]
-    report["unlisted"]["sites"] = ["channel"]
+    report["unlisted"] |= {"sites": ["channel"], "located": report["where"]["sites"][1:]}
     text = Page(render(report, None, title="x")).text
     assert "lies in the spread of the measured channel" in text
     assert "Spread of the measured channel" in text

@@ -130,13 +130,14 @@ def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | N
 def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quantity]:
     """What a column of whole numbers on several axes tells apart, as what each device did last.
 
-    Each of its values at each position of the last axis, and what it holds along the last axis all together.
+    Each of its values, anywhere and at each position of the last axis, and what it holds along that axis all together.
     """
     whole = np.issubdtype(values.dtype, np.integer) or values.dtype == bool
     if not whole or values.ndim < 2 or (values == values.flat[0]).all():
         return
-    last = values.shape[-1]
-    each = last * np.unique(values, return_inverse=True)[1].reshape(values.shape) + np.arange(last)
+    last, (distinct, index) = values.shape[-1], np.unique(values, return_inverse=True)
+    yield Quantity(name, tuple(axes), values, ordered=_OFTEN * len(distinct) > values.size)
+    each = last * index.reshape(values.shape) + np.arange(last)
     yield Quantity(f"{name} of each {axes[-1]}", tuple(axes), each, ordered=False)
     if last > 1:
         _, rows = np.unique(values.reshape(-1, last), axis=0, return_inverse=True)

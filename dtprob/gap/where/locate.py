@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
@@ -50,20 +50,26 @@ class SiteFinding:
         site: its name.
         family: what is added ("additive", "relative", "conjugate", "spread", ...) and how it varies.
         p_value: family-wise over all sites and families.
-        gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order.
+        gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order; None
+            where nothing that a model computes would move it.
         last: whether it is a moment of an observation where another site is surely wrong: a wrong mean spreads too.
     """
 
     site: str
     family: str
     p_value: float
-    gain: float
+    gain: float | None
     last: bool = False
 
     @property
     def moment(self) -> str | None:
         """What of an observation is wrong: its spread, or what lies beyond; None where values are."""
         return moment(self.family)
+
+
+def most_gained(found: Iterable[SiteFinding]) -> float:
+    """Nats that moving the best of these sites would gain; zero where there is none."""
+    return max((one.gain for one in found if one.gain is not None), default=0.0)
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ def locate(
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
     entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
-    ordered = tuple(sorted(_spreads_last(seen.findings), key=lambda f: (f.last, f.p_value, -f.gain)))
+    ordered = tuple(sorted(_spreads_last(seen.findings), key=lambda f: (f.last, f.p_value, -(f.gain or 0.0))))
     strays = differences(problem, drawn)
     return Location(ordered, blocks, maps, seen.p_value, suspected, entries, strays)
 
@@ -244,7 +250,7 @@ def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> Sit
     """The further moment of an observation with the smallest p-value; nothing that a fit could move stands for it."""
     best = min(tests, key=lambda test: test.p_value)
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
-    return SiteFinding(name, best.family.label, p_value, 0.0)
+    return SiteFinding(name, best.family.label, p_value, None)
 
 
 def _finding(

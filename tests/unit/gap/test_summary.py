@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from dtprob.gap.compose import summary
+from dtprob.gap.compose import site_shares, summary, unlisted
+from dtprob.gap.where.locate import Location, SiteFinding
 
 
 @pytest.mark.parametrize(
@@ -23,3 +24,26 @@ from dtprob.gap.compose import summary
 def test_what_explanations_share_is_said_first(sets, said):
     cause = SimpleNamespace(effects=sets[0], alias_class=sets, closed_fraction=None)
     assert summary("UNDETERMINED", (cause,), SimpleNamespace()) == said
+
+
+def test_shares_are_of_a_gap_and_of_what_can_be_moved():
+    found = [
+        SiteFinding("delay", "additive, common", 1e-9, 30.0),
+        SiteFinding("power", "additive, common", 0.01, 2.0),
+        SiteFinding("y", "spread, common", 0.2, 100.0),
+        SiteFinding("y", "dependence along link, common", 0.3, None),
+    ]
+    assert site_shares(found, 40.0, {"power": 0.9}) == [0.75, 0.9, 1.0, None]
+    assert site_shares(found, 1e-3, {"power": 0.9}) == [None] * 4
+
+
+def test_what_is_left_names_each_site_once_and_each_way_that_it_is_wrong():
+    found = (
+        SiteFinding("y", "dependence along link, common", 1e-9, None),
+        SiteFinding("y", "spread, common", 1e-3, 3.0),
+        SiteFinding("power", "additive, common", 0.3, 1.0),
+    )
+    left = unlisted(Location(found, (), {}, 1e-9), 0.005)
+    assert left["p_value"] == 1e-9
+    assert left["sites"] == ["y"]
+    assert [site["family"] for site in left["located"]] == ["dependence along link, common", "spread, common"]

@@ -85,8 +85,14 @@ def test_all_verdicts_are_known() -> None:
             r"next_measurement\.cost\[1\]: expected a finite number",
         ),
         (
-            {"unlisted": {"p_value": None, "sites": [{"site": "a", "p_value": 2, "share": 0}]}},
-            r"sites\[0\]\.p_value",
+            {
+                "unlisted": {
+                    "p_value": None,
+                    "sites": ["a"],
+                    "located": [{"site": "a", "p_value": 2, "share": 0}],
+                }
+            },
+            r"located\[0\]\.p_value",
         ),
     ],
 )

@@ -5,7 +5,7 @@ from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Cause, Detectable
 from dtprob.report.page import bar, ranked
-from dtprob.report.story import advice, next_step, tell
+from dtprob.report.story import advice, left_over, next_look, next_step, tell
 
 
 def _cause(*effects: str, alias: list[list[str]] | None = None) -> Cause:
@@ -131,6 +131,43 @@ def test_what_cannot_be_judged_is_said_where_nothing_is_found() -> None:
     report = {**_report(), "verdict": "NO_GAP", "causes": []}
     assert "2 known effects were tried" in tell(report).meaning
     assert "1 more could not be judged" in tell(report).meaning
+
+
+def _unlisted(*left: names.Site) -> names.Any:
+    found = {"p_value": 1e-9, "sites": [site["site"] for site in left], "located": list(left)}
+    nothing: names.Site = {"site": "delay", "p_value": 0.9, "share": None, "family": "spread, common"}
+    where = {"sites": [*left, nothing], "coordinates": []}
+    return {**_report(), "verdict": "UNLISTED", "causes": [], "unlisted": found, "where": where}
+
+
+def test_what_is_left_is_told_as_it_is_wrong() -> None:
+    report = _unlisted(
+        {"site": "delay", "p_value": 1e-9, "share": None, "family": "dependence on rss, common"}
+    )
+    assert "lies in the dependence of the delay on RSS" in tell(report).meaning
+    assert "cause the dependence of the delay on RSS, or declare errors that are so" in tell(report).action
+    assert next_look(report).endswith("Look for what could cause the dependence of the delay on RSS.")
+
+
+def test_a_value_that_is_wrong_calls_for_physics() -> None:
+    values: names.Site = {"site": "range", "p_value": 1e-9, "share": 0.5, "family": "additive, common"}
+    spread: names.Site = {"site": "y", "p_value": 1e-3, "share": None, "family": "spread, by wall"}
+    assert "Look for physics" in tell(_unlisted(values, spread)).action
+    assert (
+        "change the range and change the spread of the labels" not in tell(_unlisted(values, spread)).action
+    )
+    assert "change the spread of the labels, or declare" in tell(_unlisted(spread)).action
+
+
+def test_a_site_that_is_wrong_in_two_ways_is_told_as_it_is_most_surely() -> None:
+    two = [
+        {"site": "y", "p_value": p, "share": None, "family": f}
+        for p, f in ((1e-9, "tails"), (1e-3, "spread"))
+    ]
+    report = {**_unlisted(), "unlisted": {"p_value": 1e-9, "sites": ["y"], "located": two}}
+    assert [names.located_words(site) for site in left_over(report)] == ["tails of the labels"]
+    bare = {**report, "unlisted": {"p_value": 1e-9, "sites": ["y"]}}
+    assert [names.located_words(site) for site in left_over(bare)] == ["labels"]
 
 
 def _report(**terms: list[float]) -> names.Any:

@@ -43,7 +43,7 @@ def _report(verdict: str) -> dict[str, Any]:
             "floor": [-INF, 0.1],
             "in_user_terms": {"channel_nmse_db": [-INF, NAN], "throughput": [0.5, NAN]},
         },
-        "unlisted": {"p_value": NAN, "sites": [site]},
+        "unlisted": {"p_value": NAN, "sites": ["path_delay"], "located": [site]},
         "next_measurement": None,
         "detectable": [{"effect": "b[x]", "size": INF}, {"effect": "b[y]", "size": 1.0}],
         "screening": [candidate],

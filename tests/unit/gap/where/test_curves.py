@@ -37,7 +37,10 @@ def test_what_takes_many_values_has_none_of_its_own(table):
 def test_whole_numbers_on_several_axes_make_groups_of_each_and_of_all():
     rng = np.random.default_rng(1)
     did = rng.integers(0, 2, (5, 60, 3))
-    each, together = groups("did", ("episode", "slot", "device"), did)
+    anywhere, each, together = groups("did", ("episode", "slot", "device"), did)
+    (by_itself,) = anywhere.curves()
+    assert by_itself.label == "by value of did"
+    assert by_itself.values.toarray().reshape(2, 5, 60, 3)[1].tolist() == did.tolist()
     assert each.axes == ("episode", "slot", "device")
     assert together.axes == ("episode", "slot")
     (by_device,), (by_all,) = each.curves(), together.curves()
@@ -55,6 +58,7 @@ def test_groups_are_of_whole_numbers_that_come_often():
     assert not list(groups("level", ("link", "place"), np.zeros((10, 40))))
     assert not list(groups("device", ("link",), np.arange(10)))
     assert not list(groups("valid", ("link", "place"), np.ones((10, 40), bool)))
-    (each, together) = groups("code", ("link", "place"), np.arange(400).reshape(200, 2))
+    (anywhere, each, together) = groups("code", ("link", "place"), np.arange(400).reshape(200, 2))
+    assert next(anywhere.curves()).label == "along code"  # so many that near ones may act alike
     assert not list(each.curves())
     assert not list(together.curves())
