@@ -153,6 +153,12 @@ def site_shares(found: Sequence[SiteFinding], gap: float, closed: Mapping[str, f
     ]
 
 
+def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, float, float]:
+    """Values by their shares, moments by their p-values."""
+    found, share = one
+    return found.last, found.p_value > _TOLD, -(share or 0.0) * (found.moment is None), found.p_value
+
+
 def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:
     return {"site": found.site, "p_value": found.p_value, "share": share, "family": found.family}
 
@@ -167,12 +173,7 @@ def _where(evidence: Evidence) -> dict[str, Any]:
     before = evidence.before.sites
     sites = zip(before, site_shares(before, gap, closed), strict=True)
     return {
-        "sites": [
-            _located(*one)
-            for one in sorted(
-                sites, key=lambda s: (s[0].last, s[0].p_value > _TOLD, -(s[1] or 0.0), s[0].p_value)
-            )
-        ],
+        "sites": [_located(*one) for one in sorted(sites, key=_rank)],
         "coordinates": [
             {
                 "axes": {c.axis: [c.low, c.high]},

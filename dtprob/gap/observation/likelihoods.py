@@ -37,6 +37,7 @@ class Likelihood:
         respread: the same for the first row that is no location.
         log_scale: of families whose first rows are normal, the logarithm of the scale for a unit step of that row.
         is_outcome: whether one of a few outcomes is seen.
+        is_complex: whether the first two rows are the real and the imaginary part of one.
         trailing: axes that a parameter has beyond those of the value.
         log_prob: log density of each entry given those before it, where the entries of the last axis are one vector.
     """
@@ -50,6 +51,7 @@ class Likelihood:
     respread: Move | None = None
     log_scale: float | None = None
     is_outcome: bool = False
+    is_complex: bool = False
     trailing: Mapping[str, int] = field(default_factory=dict)
     log_prob: Rows | None = None
 
@@ -135,6 +137,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.complex_normal_residual,
         residuals.complex_normal_shift,
         located=2,
+        is_complex=True,
         relocate=_to_loc(lambda p: jnp.sqrt(p["variance"] / 2)),
         respread=_grown("variance"),
         log_scale=0.5,
@@ -145,6 +148,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.complex_student_residual,
         residuals.complex_student_shift,
         located=2,
+        is_complex=True,
         relocate=_to_loc(
             lambda p: jnp.sqrt(p["variance"] * (1 + 2 * p["tail"]) / 2) / (1 + p["tail"]),
         ),

@@ -52,7 +52,7 @@ class SiteFinding:
         p_value: family-wise over all sites and families.
         gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order; None
             where nothing that a model computes would move it.
-        last: whether it is a moment of an observation where another site is surely wrong: a wrong mean spreads too.
+        last: whether it may be the shadow of another: a wrong mean spreads too, and far strays look like wrong means.
     """
 
     site: str
@@ -121,7 +121,7 @@ def locate(
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
     entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
-    ordered = tuple(sorted(_spreads_last(seen.findings), key=lambda f: (f.last, f.p_value, -(f.gain or 0.0))))
+    ordered = tuple(sorted(_shadows_last(seen.findings), key=lambda f: (f.last, f.p_value, -(f.gain or 0.0))))
     strays = differences(problem, drawn)
     return Location(ordered, blocks, maps, seen.p_value, suspected, entries, strays)
 
@@ -240,10 +240,12 @@ def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
             yield gain.reshape(*site.value.shape, -1).sum(-1)
 
 
-def _spreads_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
-    mean = [f.moment is None for f in findings]
-    sure = any(f.p_value <= _SURE and m for f, m in zip(findings, mean, strict=True))
-    return [replace(f, last=sure and not m) for f, m in zip(findings, mean, strict=True)]
+def _shadows_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
+    """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong."""
+    of_values = min((f.p_value for f in findings if f.moment is None), default=1.0)
+    of_moments = min((f.p_value for f in findings if f.moment is not None), default=1.0)
+    sure, by_noise = of_values <= _SURE, of_moments < of_values**2
+    return [replace(f, last=sure and (f.moment is None) == by_noise) for f in findings]
 
 
 def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> SiteFinding:

@@ -2,7 +2,9 @@
 
 Rows of a right twin are independent of each other, and normal where the observation is. Dependence is the product of two
 rows; skewness and tails are smooth functions of a normal row that no small change of its mean or scale moves (Neyman's
-smooth tests with fitted parameters: Thomas and Pierce, JASA 74 (1979)). What each is of a right twin, replicates tell.
+smooth tests with fitted parameters: Thomas and Pierce, JASA 74 (1979)). Complex rows have a product with the conjugate, and
+their square where noise is not circular (Picinbono, IEEE Trans. Signal Process. 42 (1994)). What each is of a right twin,
+replicates tell.
 """
 
 from __future__ import annotations
@@ -28,8 +30,10 @@ _OUTPUTS: Final = 8
 _ODD: Final = math.sqrt(3.0 / math.pi)
 _EVEN: Final = math.sqrt(15.0 / 2.0) / math.pi
 """Covariance of the first two Legendre polynomials of a normal variable's probability with the variable and its square."""
+_POWER: Final = math.sqrt(12.0) / 4.0
+"""Covariance of the first one, of an exponential variable's probability, with the variable."""
 
-_MOMENTS: Final = ("spread", "skewness", "tails", "dependence")
+_MOMENTS: Final = ("spread", "skewness", "tails", "circularity", "dependence")
 """First words of kinds that are no change of values."""
 
 
@@ -47,10 +51,12 @@ def further_moments(problem: Problem, rows: np.ndarray) -> Iterator[tuple[str, F
         rows: projected ones (n, cluster, row), of the data first.
     """
     looked = {
-        name: own[:, : problem.located[name]]
+        name: own[:, :1] + 1j * own[:, 1:2] if is_complex else own[:, : problem.located[name]]
         for name, own in problem.by_observation(rows).items()
-        if problem.located[name] == 1 or LIKELIHOODS[problem.families[name]].is_outcome
         if own[0].size <= _MOST
+        if (is_complex := LIKELIHOODS[problem.families[name]].is_complex)
+        or problem.located[name] == 1
+        or LIKELIHOODS[problem.families[name]].is_outcome
     }
     for name, row in looked.items():
         axes, known = problem.declaration.observed[name].axes, LIKELIHOODS[problem.families[name]]
@@ -67,10 +73,10 @@ def further_moments(problem: Problem, rows: np.ndarray) -> Iterator[tuple[str, F
 
 
 def _pooled(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
-    """Values (n, *entry) less what replicates have at the mean, summed over all axes but those kept."""
+    """Values (n, *entry) less what replicates have at the mean, summed over all axes but those kept; both parts of each."""
     centred = values - values[1:].mean(axis=0)
     rest = tuple(1 + i for i in range(values.ndim - 1) if i not in kept)
-    return centred.sum(rest).reshape(len(values), -1)
+    return np.ascontiguousarray(centred.sum(rest).reshape(len(values), -1)).view(float)
 
 
 def _is_near_normal(scores: np.ndarray) -> bool:
@@ -80,25 +86,35 @@ def _is_near_normal(scores: np.ndarray) -> bool:
 
 
 def _shape(row: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
-    yield "skewness", skewness(row)
-    yield "tails", tails(row)
+    if np.iscomplexobj(row):
+        yield "circularity", row**2
+        yield "tails", complex_tails(row)
+    else:
+        yield "skewness", skewness(row)
+        yield "tails", tails(row)
 
 
 def _dependence(
     row: np.ndarray, axes: tuple[str, ...], others: dict[str, np.ndarray]
 ) -> Iterator[tuple[str, np.ndarray]]:
     """Products of rows (n, component, *entry), summed over the components."""
+    last = row.shape[-1] if row.ndim > 3 else 1
+    pairs = list(itertools.combinations(range(last), 2)) if last <= _OUTPUTS else []
     for i, axis in enumerate(axes):
-        if (n := row.shape[2 + i]) > 2:
+        n, is_the_pair = row.shape[2 + i], i == row.ndim - 3 and len(pairs) == 1
+        if n > 1 and not is_the_pair:
             ahead, behind = np.take(row, range(1, n), 2 + i), np.take(row, range(n - 1), 2 + i)
-            yield f"dependence along {axis}", (ahead * behind).sum(1)
-    if 1 < row.shape[-1] <= _OUTPUTS and len(axes) > 1:
-        pairs = itertools.combinations(range(row.shape[-1]), 2)
-        together = np.stack([(row[..., a] * row[..., b]).sum(1) for a, b in pairs], axis=-1)
+            yield f"dependence along {axis}", _product(ahead, behind)
+    if pairs:
+        together = np.stack([_product(row[..., a], row[..., b]) for a, b in pairs], axis=-1)
         yield f"dependence from {axes[-1]} to {axes[-1]}", together
     for name, other in others.items():
         if other.shape == row.shape:
-            yield f"dependence on {name}", (row * other).sum(1)
+            yield f"dependence on {name}", _product(row, other)
+
+
+def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
+    return (one * other.conj()).sum(1)
 
 
 def skewness(row: np.ndarray) -> np.ndarray:
@@ -110,3 +126,9 @@ def tails(row: np.ndarray) -> np.ndarray:
     """An even function of a standard normal variable, uncorrelated with its square; negative where tails are heavy."""
     u = ndtr(row)
     return math.sqrt(5.0) * (6 * u * (u - 1) + 1) - _EVEN * (row**2 - 1.0) / math.sqrt(2.0)
+
+
+def complex_tails(row: np.ndarray) -> np.ndarray:
+    """A function of the power of a circular normal variable of variance two, uncorrelated with it; negative where heavy."""
+    power = np.abs(row) ** 2 / 2.0
+    return math.sqrt(12.0) * (0.5 - np.exp(-power)) - _POWER * (power - 1.0)
