@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
 
+import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.plausible import prior_scale, scales, sizes
@@ -98,13 +100,19 @@ def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float
             curvature[block.index] = 1 / sd**2
         for parameter in effect.fitted:
             block = problem.layout[effect.site_name(parameter.name)]
-            value = jnp.asarray(x[block.index[0]]).reshape(parameter.shape)
+            value = x[block.index[0]].reshape(parameter.shape)
             sd = np.asarray(prior_scale(parameter.prior)) * np.ones(parameter.shape)
-            inside = jnp.maximum(value, parameter.null + 1e-9 * sd) if parameter.is_one_sided else value
-            total += float(jnp.sum(parameter.prior.log_prob(inside)))  # the null may not count as support
-            gradient[block.index[0]] = -((np.asarray(value) - parameter.null) / sd**2).reshape(-1)
+            inside = np.maximum(value, parameter.null + 1e-9 * sd) if parameter.is_one_sided else value
+            total += float(_log_prob(parameter.prior, inside))  # the null may not count as support
+            gradient[block.index[0]] = -((value - parameter.null) / sd**2).reshape(-1)
             curvature[block.index[0]] = (1 / sd**2 * np.ones(parameter.shape)).reshape(-1)
     return total, gradient, curvature
+
+
+@jax.jit
+def _log_prob(prior: dist.Distribution, value: np.ndarray) -> jax.Array:
+    """Of all entries together; one program for each kind of distribution, whose numbers are arguments."""
+    return jnp.sum(prior.log_prob(value))
 
 
 def basis(problem: Problem, active: Active) -> np.ndarray:
