@@ -1,0 +1,111 @@
+"""The fit that a diagnosis starts from leaves local optima, and stops looking where all ways lead to one mode."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.gap.fitting import base
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.model.problem import Problem
+from dtprob.models.declaration import model
+
+PLACES, TRUE, NOISE = np.linspace(0.0, 1.0, 40), 11.3, 0.5
+
+
+@model(cluster="place", axes={"expected": ("place",), "y": ("place",)})
+def tone(place, y=None):
+    """A wave of unknown frequency: its likelihood has a peak every few radians."""
+    frequency = numpyro.sample("frequency", dist.Normal(8.0, 8.0))
+    expected = numpyro.deterministic("expected", jnp.sin(frequency * place))
+    with numpyro.plate("place", len(PLACES)):
+        numpyro.sample("y", dist.Normal(expected, NOISE), obs=y)
+
+
+@pytest.fixture(scope="module")
+def problem():
+    y = np.sin(TRUE * PLACES) + NOISE * np.random.default_rng(1).normal(size=PLACES.size)
+    return Problem(tone, {"place": jnp.asarray(PLACES), "y": jnp.asarray(y)}, [])
+
+
+@pytest.fixture(scope="module")
+def curve(problem):
+    """Frequencies and the log density there, up to a constant, by its own formula."""
+    grid = np.linspace(-24.0, 40.0, 12_801)
+    misses = np.asarray(problem.data["y"]) - np.sin(np.outer(grid, PLACES))
+    return grid, -0.5 * (misses**2).sum(1) / NOISE**2 - 0.5 * ((grid - 8.0) / 8.0) ** 2
+
+
+def at(problem, frequency):
+    x = problem.null()
+    x[problem.layout["frequency"].index[0]] = frequency
+    return x
+
+
+def frequency(problem, fitted):
+    return float(fitted.x[problem.layout["frequency"].index[0, 0]])
+
+
+def test_the_curve_has_several_peaks(curve):
+    assert len(base.local_maxima(curve[1])) >= 5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_best_peak_is_found_from_any_draws(problem, curve, seed):
+    grid, density = curve
+    best = grid[density.argmax()]
+    assert frequency(problem, base.fit_base(problem, jax.random.key(seed))) == pytest.approx(best, abs=0.02)
+
+
+def test_one_start_at_a_wrong_peak_is_freed(problem, curve):
+    grid, density = curve
+    tops = base.local_maxima(density)
+    wrong = grid[tops[np.argsort(density[tops])[-2]]]
+    fitted = fitting.fit(problem, at(problem, wrong))
+    assert frequency(problem, fitted) == pytest.approx(wrong, abs=0.05)
+    freed = base.polish(problem, fitted)
+    assert frequency(problem, freed) == pytest.approx(grid[density.argmax()], abs=0.02)
+    assert freed.log_posterior > fitted.log_posterior + 1.0
+
+
+def test_the_search_is_over_where_a_mode_that_was_freed_is_reached(problem, curve, monkeypatch):
+    grid, density = curve
+    tops = base.local_maxima(density)
+    best = base.polish(problem, fitting.fit(problem, at(problem, grid[density.argmax()])))
+    wrong = fitting.fit(problem, at(problem, grid[tops[np.argsort(density[tops])[-2]]]))
+    looks = counted(monkeypatch, "_other_peaks")
+    alone = base.polish(problem, wrong)
+    without = len(looks)
+    looks.clear()
+    beside = base.polish(problem, wrong, freed=[best])
+    assert len(looks) == without - 1  # no last look from the best mode
+    assert frequency(problem, beside) == pytest.approx(frequency(problem, alone), abs=1e-6)
+    looks.clear()
+    assert base.polish(problem, best, freed=[best]) is best
+    assert not looks
+
+
+def test_no_third_start_is_freed_where_two_end_in_one_mode(problem, curve, monkeypatch):
+    grid, density = curve
+    tops = base.local_maxima(density)
+    highest = tops[np.argsort(-density[tops])[:4]]
+    fits = [fitting.fit(problem, at(problem, frequency)) for frequency in grid[highest]]
+    monkeypatch.setattr(base, "_apart", lambda _: fits)
+    freed = counted(monkeypatch, "polish")
+    found = base.fit_base(problem, jax.random.key(0), polished=4)
+    assert len(freed) == 2
+    assert frequency(problem, found) == pytest.approx(grid[density.argmax()], abs=0.02)
+
+
+def counted(monkeypatch, name):
+    """The calls of a function of the module, as they come."""
+    calls, real = [], getattr(base, name)
+
+    def call(*arguments, **named):
+        calls.append(name)
+        return real(*arguments, **named)
+
+    monkeypatch.setattr(base, name, call)
+    return calls
