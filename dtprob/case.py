@@ -214,13 +214,20 @@ def read_document(path: Path) -> dict[str, Any]:
     """The sections of a TOML file.
 
     Raises:
-        InputError: no such file, or not TOML.
+        InputError: no such file, a folder, or not TOML.
     """
+    if path.is_dir():
+        inside = sorted(path.glob("*.toml")) or [path / "case.toml"]
+        raise InputError(str(path), "a CASE file (TOML)", "a folder", f"Name the file: {inside[0]}")
     if not path.is_file():
         raise InputError(str(path), "a CASE file (TOML)", "no such file", "Check the name and the folder")
     try:
         return tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError:
+        raise InputError(
+            str(path), "a CASE file (TOML)", "no text", "Name the TOML file, not the data"
+        ) from None
+    except tomllib.TOMLDecodeError as error:
         raise InputError(str(path), "a TOML file", str(error), "Correct the file there") from None
 
 

@@ -158,6 +158,18 @@ def test_missing_file(tmp_path):
         load_case(tmp_path / "none.toml")
 
 
+def test_a_folder_is_answered_with_the_file_inside(tmp_path):
+    file = written(tmp_path, SHORT)
+    with pytest.raises(InputError, match=rf"got a folder\. Name the file: {file}"):
+        load_case(tmp_path)
+
+
+def test_data_are_no_case(tmp_path):
+    (tmp_path / "table.npz").write_bytes(b"PK\x03\xc4\xff")
+    with pytest.raises(InputError, match=r"got no text\. Name the TOML file"):
+        load_case(tmp_path / "table.npz")
+
+
 def test_own_module_beside_the_case(tmp_path):
     for folder, value in (("a", 1), ("b", 2)):
         (tmp_path / folder).mkdir()
