@@ -40,6 +40,8 @@ _OPEN_WHERE_SHOWN: Final = (1e-6, 0.1)
 """The same where the effects' scores show the gap, and the sites say mostly where it lies."""
 _OPEN_AT_SECOND: Final = (0.01, 10.0)
 """Multiples of the level between which a second look does not tell it either."""
+_OPEN_OF_OUTCOMES: Final = 1e-6
+"""The lower one of outcomes and counts: hundreds of replicates still understate how far rare ones stray."""
 
 
 @dataclass(frozen=True)
@@ -137,7 +139,7 @@ def _further_looks(
         yield second, (0.0 if discrete else low, high)
     if most > second:
         low, high = _OPEN_AT_SECOND
-        yield most, (low * settings.level / 2, high * settings.level / 2)
+        yield most, ((_OPEN_OF_OUTCOMES if discrete else low) * settings.level / 2, high * settings.level / 2)
 
 
 class _Tested(NamedTuple):

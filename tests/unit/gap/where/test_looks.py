@@ -29,7 +29,7 @@ def test_where_a_gap_is_shown_the_first_look_mostly_suffices():
 def test_outcomes_are_looked_at_again_however_surely_wrong_they_seem():
     (_, (low, high)), (_, third) = looks(99, 1000, shown=True, discrete=True)
     assert (low, high) == (0.0, 0.1)
-    assert third == pytest.approx((5e-5, 0.05))
+    assert third == pytest.approx((5e-9, 0.05))
 
 
 @pytest.mark.parametrize(
