@@ -83,7 +83,8 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
         case "UNLISTED":
             sites = ", ".join(_place(s) for s in evidence.after.sites[:2] if s.p_value <= 0.01)
             tail = f" It shows at {sites}." if sites else ""
-            part = f" {name} imitates part of it." if name else ""
+            verb = "imitate" if best is not None and len(best.effects) > 1 else "imitates"
+            part = f" {name} {verb} part of it." if name else ""
             return f"There is a gap, and none of the known effects explains it.{tail}{part}"
         case _:
             if best is None:

@@ -25,6 +25,7 @@ _SHORT = 4
 _LONG = 3
 _ENOUGH = 3
 _SAME = 0.1
+_PATIENCE = 40
 _COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
 
 
@@ -64,8 +65,19 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         freed.append(polish(problem, fitted, freed=freed))
         if any(_is_same(freed[-1], other) for other in freed[:-1]):
             break  # two starts that end in one mode
-    best = settled(problem, max([*freed, *found[polished:]], key=lambda f: f.log_posterior))
+    best = max([*freed, *found[polished:]], key=lambda f: f.log_posterior)
+    best = settled(problem, best if best.converged else followed(problem, best))
     return polish(problem, best, added) if added and not polished else best
+
+
+def followed(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
+    """Where a fit that still climbs leads: along a bent ridge, as of a path's delay and its gain's phase, it crawls."""
+    for _ in range(_PATIENCE):
+        further = fitting.fit(problem, fitted.x, fitted.effects, spread=fitted.spread)
+        gain, fitted = further.log_posterior - fitted.log_posterior, further
+        if fitted.converged or gain < _SAME:
+            break
+    return fitted
 
 
 def _apart(fits: list[fitting.Fit]) -> list[fitting.Fit]:

@@ -19,6 +19,8 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import LIKELIHOODS
 from dtprob.gap.where.curves import Curves, Quantity, cycles, stretches
 
+_BAND: Final = 6
+"""Entries of an axis from which it may be a band, whose mirror frequency an imbalance of I and Q brings in."""
 _ROWS: Final = 8
 """Positions of a second axis from which rows may follow one another from cluster to cluster."""
 _COLUMNS: Final = 16
@@ -136,6 +138,8 @@ def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients
             if grown.shape[i] > 1:
                 kinds[f"from the next {axis}"] = np.roll(grown, -1, i)
                 kinds[f"from the last {axis}"] = np.roll(grown, 1, i)
+            if grown.shape[i] >= _BAND and (i or grown.ndim == 1):  # axis 0 is the clusters'
+                kinds[f"image along {axis}"] = np.conj(np.flip(grown, i))
     return Site(name, axes, grown, gradients, kinds)
 
 

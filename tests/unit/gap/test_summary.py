@@ -26,6 +26,13 @@ def test_what_explanations_share_is_said_first(sets, said):
     assert summary("UNDETERMINED", (cause,), SimpleNamespace()) == said
 
 
+@pytest.mark.parametrize(("effects", "said"), [(("a",), "a imitates"), (("a", "b"), "a and b imitate")])
+def test_what_imitates_part_of_an_unknown_cause_is_said(effects, said):
+    cause = SimpleNamespace(effects=effects, alias_class=(effects,), closed_fraction=None)
+    evidence = SimpleNamespace(after=Location((), (), {}, 1e-9))
+    assert summary("UNLISTED", (cause,), evidence).endswith(f" {said} part of it.")
+
+
 def test_shares_are_of_a_gap_and_of_what_can_be_moved():
     found = [
         SiteFinding("delay", "additive, common", 1e-9, 30.0),

@@ -10,6 +10,7 @@ import pytest
 from dtprob.gap.fitting import base
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.model.problem import Problem
+from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
 
 PLACES, TRUE, NOISE = np.linspace(0.0, 1.0, 40), 11.3, 0.5
@@ -97,6 +98,37 @@ def test_no_third_start_is_freed_where_two_end_in_one_mode(problem, curve, monke
     found = base.fit_base(problem, jax.random.key(0), polished=4)
     assert len(freed) == 2
     assert frequency(problem, found) == pytest.approx(grid[density.argmax()], abs=0.02)
+
+
+@model(cluster="position", axes={"expected": ("position", "tone"), "channel": ("position", "tone")})
+def echo(distance, frequency, channel=None):
+    """An echo of unknown extra way, whose phase turns by a whole turn in each 5 cm: its gain's phase must turn with it."""
+    gain = numpyro.sample("gain", dist.Normal(0.0, 1.0).expand([2]).to_event(1))
+    way = numpyro.sample("way", dist.Normal(20.0, 2.0))
+    wave = jnp.exp(-2j * jnp.pi * frequency * (distance[:, None] + way) / 3e8) / distance[:, None]
+    expected = numpyro.deterministic("expected", (gain[0] + 1j * gain[1]) * wave)
+    with numpyro.plate("position", distance.size, dim=-2), numpyro.plate("tone", frequency.size, dim=-1):
+        numpyro.sample("channel", ComplexNormal(expected, 1e-4), obs=channel)
+
+
+def test_a_fit_that_crawls_along_a_ridge_is_followed_to_its_end():
+    rng = np.random.default_rng(5)
+    distance, frequency = rng.uniform(1, 3, 20), 6e9 + np.linspace(-5e7, 5e7, 12)
+    true = 20.6
+    wave = np.exp(-2j * np.pi * frequency * (distance[:, None] + true) / 3e8) / distance[:, None]
+    noise = 1e-2 * (rng.normal(size=wave.shape) + 1j * rng.normal(size=wave.shape)) / np.sqrt(2)
+    data = {"distance": distance, "frequency": frequency, "channel": 0.5 * wave + noise}
+    problem = Problem(echo, {name: jnp.asarray(value) for name, value in data.items()}, [])
+    start = problem.null()
+    start[problem.layout["way"].index[0]] = 20.2
+    crawling = fitting.fit(problem, start)
+    assert not crawling.converged
+    found = base.followed(problem, crawling)
+    assert found.converged
+    assert found.x[problem.layout["way"].index[0, 0]] == pytest.approx(true, abs=0.05)
+    fitted = base.fit_base(problem, jax.random.key(0))
+    assert fitted.converged
+    assert fitted.log_posterior == pytest.approx(found.log_posterior, abs=0.1)
 
 
 def counted(monkeypatch, name):

@@ -71,6 +71,7 @@ def test_scores_are_the_slope_along_what_a_family_perturbs(problem, shape):
         "relative",
         "conjugate",
         *(f"from the {side} {axis}" for side in ("next", "last") for axis in ("row", "antenna")),
+        *(["image along antenna"] if shape[1] > 5 else []),
     }
 
 
@@ -85,6 +86,13 @@ def test_a_column_may_act_on_each_entry_of_a_short_second_axis_otherwise(problem
     found = {f.label: family_test(f, scores) for f, scores in families(partial(curves, problem), [], site)}
     assert found["additive, along x"].p_value > 0.01
     assert found["additive, along x x option"].p_value < 1e-3
+
+
+def test_a_mirror_frequency_leaks_into_an_entry(problem):
+    site = complex_site(problem, (LENGTH, 8), ("row", "subcarrier"))
+    found = {family.label: family for family, _ in families(partial(curves, problem), (), site)}
+    step = found["image along subcarrier, common"].step(np.array([1.0, 0.0]), np.ones(2), site.value)
+    np.testing.assert_allclose(step, site.value[:, ::-1].conj())
 
 
 def test_a_neighbour_leaks_into_an_entry(problem):
