@@ -3,22 +3,21 @@
 Rows of a right twin are independent of each other, and normal where the observation is. Dependence is the product of two
 rows; skewness and tails are smooth functions of a normal row that no small change of its mean or scale moves (Neyman's
 smooth tests with fitted parameters: Thomas and Pierce, JASA 74 (1979)). Complex rows have a product with the conjugate, and
-their square where noise is not circular (Picinbono, IEEE Trans. Signal Process. 42 (1994)). What each is of a right twin,
-replicates tell.
+their square where noise is not circular (Picinbono, IEEE Trans. Signal Process. 42 (1994)). All are bounded: one far row
+of a right twin must not look like more. What each is of a right twin, replicates tell.
 """
 
 from __future__ import annotations
 
 import itertools
-import math
 from collections.abc import Iterator
 from typing import Final
 
 import numpy as np
-from scipy.special import ndtr
 
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import LIKELIHOODS
+from dtprob.gap.where.bounded import complex_tails, scored, skewness, tails
 from dtprob.gap.where.families import Family, Pattern
 
 _MOST: Final = 1 << 16
@@ -27,12 +26,6 @@ _HEAVIEST: Final = 4.0
 """Kurtosis over replicates up to which a sum of products of outcomes is looked at; 3 of a normal one."""
 _OUTPUTS: Final = 8
 """Entries of a last axis up to which each pair is looked at."""
-_ODD: Final = math.sqrt(3.0 / math.pi)
-_EVEN: Final = math.sqrt(15.0 / 2.0) / math.pi
-"""Covariance of the first two Legendre polynomials of a normal variable's probability with the variable and its square."""
-_POWER: Final = math.sqrt(12.0) / 4.0
-"""Covariance of the first one, of an exponential variable's probability, with the variable."""
-
 _MOMENTS: Final = ("spread", "skewness", "tails", "circularity", "dependence")
 """First words of kinds that are no change of values."""
 
@@ -50,21 +43,26 @@ def further_moments(problem: Problem, rows: np.ndarray) -> Iterator[tuple[str, F
         problem: the model and candidates on their data.
         rows: projected ones (n, cluster, row), of the data first.
     """
+    families = {name: LIKELIHOODS[family] for name, family in problem.families.items()}
     looked = {
-        name: own[:, :1] + 1j * own[:, 1:2] if is_complex else own[:, : problem.located[name]]
+        name: own[:, :1] + 1j * own[:, 1:2] if families[name].is_complex else own[:, : problem.located[name]]
         for name, own in problem.by_observation(rows).items()
         if own[0].size <= _MOST
-        if (is_complex := LIKELIHOODS[problem.families[name]].is_complex)
-        or problem.located[name] == 1
-        or LIKELIHOODS[problem.families[name]].is_outcome
+        if families[name].is_complex or problem.located[name] == 1 or families[name].is_outcome
+    }
+    products = {
+        name: row
+        if families[name].is_outcome
+        else scored(row, is_normal=families[name].log_scale is not None)
+        for name, row in looked.items()
     }
     for name, row in looked.items():
-        axes, known = problem.declaration.observed[name].axes, LIKELIHOODS[problem.families[name]]
+        axes, known = problem.declaration.observed[name].axes, families[name]
         others = {
-            n: r for n, r in looked.items() if n > name and problem.declaration.observed[n].axes == axes
+            n: r for n, r in products.items() if n > name and problem.declaration.observed[n].axes == axes
         }
         shape = _shape(row[:, 0]) if known.log_scale is not None else ()
-        for kind, values in (*shape, *_dependence(row, axes, others)):
+        for kind, values in (*shape, *_dependence(products[name], axes, others)):
             for kept in ((), *((i,) for i in range(len(axes)) if values.shape[1 + i] > 1)):
                 scores = _pooled(values, kept)
                 if not known.is_outcome or _is_near_normal(scores[1:]):
@@ -87,7 +85,7 @@ def _is_near_normal(scores: np.ndarray) -> bool:
 
 def _shape(row: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
     if np.iscomplexobj(row):
-        yield "circularity", row**2
+        yield "circularity", scored(row, is_normal=True) ** 2
         yield "tails", complex_tails(row)
     else:
         yield "skewness", skewness(row)
@@ -115,20 +113,3 @@ def _dependence(
 
 def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:
     return (one * other.conj()).sum(1)
-
-
-def skewness(row: np.ndarray) -> np.ndarray:
-    """An odd function of a standard normal variable, bounded but for what is linear in it."""
-    return math.sqrt(12.0) * (ndtr(row) - 0.5) - _ODD * row
-
-
-def tails(row: np.ndarray) -> np.ndarray:
-    """An even function of a standard normal variable, uncorrelated with its square; negative where tails are heavy."""
-    u = ndtr(row)
-    return math.sqrt(5.0) * (6 * u * (u - 1) + 1) - _EVEN * (row**2 - 1.0) / math.sqrt(2.0)
-
-
-def complex_tails(row: np.ndarray) -> np.ndarray:
-    """A function of the power of a circular normal variable of variance two, uncorrelated with it; negative where heavy."""
-    power = np.abs(row) ** 2 / 2.0
-    return math.sqrt(12.0) * (0.5 - np.exp(-power)) - _POWER * (power - 1.0)
