@@ -16,24 +16,28 @@ from dtprob.effects.network.slots import mixed, sender_count
 
 
 def reception_shift(sites: Sites, _data: Data) -> list[Effect]:
-    """With a given number of senders more or fewer packets are delivered."""
+    """With a given number of senders more or fewer packets are delivered: all of a slot's together, or one by one."""
     if not offers(sites, "reception_logits"):
         return []
     effects: list[Effect] = []
     for count in range(1, sites["reception_logits"].shape[-1]):
 
         def tilt(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], count: int = count) -> Any:
-            own = sender_count(context) == count
-            return value + p["log_odds"] * own[..., None] * np.arange(value.shape[-1])
+            deliveries = np.arange(value.shape[-1])
+            change = p["log_odds_of_any"] * (deliveries > 0)
+            if count > 1:
+                change = change + p["log_odds_of_further"] * np.maximum(deliveries - 1, 0)
+            return value + (sender_count(context) == count)[..., None] * change
 
+        further = (normal("log_odds_of_further", 1.0),) if count > 1 else ()
         effects.append(
             Effect(
                 "reception_shift",
                 {"reception_logits": tilt},
-                (normal("log_odds", 1.0),),
+                (normal("log_odds_of_any", 1.0), *further),
                 instance=f"{count}_senders",
-                physics=f"The odds of each further delivery change when {count} devices send.",
-                source="Exponential tilt: P(d) exp(c d).",
+                physics=f"The odds of a delivery, and of each further one, change when {count} devices send.",
+                source="Exponential tilt: P(d) exp(a [d > 0] + c max(d - 1, 0)).",
                 requires=("sending",),
             )
         )

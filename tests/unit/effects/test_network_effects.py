@@ -245,6 +245,23 @@ def test_mixtures_of_receptions_stay_laws(offered, data, name, amount):
     assert np.abs(mean[senders >= 1]).max() > 0.01
 
 
+def test_receptions_shift_all_of_a_slot_at_once_or_one_by_one(offered, data):
+    """Slots that are lost whole keep the law of what else is delivered; of further deliveries the law of any is kept."""
+    senders = np.asarray(data["sending"]).sum(-1)
+    before, two = law(data, site="reception_logits"), senders == 2
+    shift = offered["reception_shift[2_senders]"]
+    lost = 0.25
+    none, some = before[two][:, 0], 1 - before[two][:, 0]
+    odds = np.log((1 - lost) * some / (none + lost * some) / (some / none))
+    silenced = law(data, shift, "reception_logits", log_odds_of_any=float(odds[0]), log_odds_of_further=0.0)
+    np.testing.assert_allclose(silenced[two][:, 1:], (1 - lost) * before[two][:, 1:], rtol=1e-5, atol=1e-8)
+    np.testing.assert_allclose(silenced[~two], before[~two], rtol=1e-6, atol=1e-12)
+    further = law(data, shift, "reception_logits", log_odds_of_any=0.0, log_odds_of_further=0.7)
+    ratio = (further[two][:, 2] / further[two][:, 1]) / (before[two][:, 2] / before[two][:, 1])
+    np.testing.assert_allclose(ratio, np.exp(0.7), rtol=1e-5)
+    assert [p.name for p in offered["reception_shift[1_senders]"].parameters] == ["log_odds_of_any"]
+
+
 def test_a_stranger_takes_its_share_of_the_deliveries(offered, data):
     senders = np.asarray(data["sending"]).sum(axis=-1)
     value = trace_model(multi_access, data, jax.random.key(0), TABLES)["reception_logits"]["value"]
