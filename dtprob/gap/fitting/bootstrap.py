@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.leverage import lost_spread
+from dtprob.gap.fitting.leverage import Leverage, leverage
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -22,6 +22,13 @@ _MOST_VALUES: Final = 2e7
 """Values of sites that further replicates may hold together."""
 
 
+class Added(NamedTuple):
+    """Parts of what was added to the data's scores: rows (part, cluster, row), site gradients (part, *site) by site."""
+
+    rows: np.ndarray
+    gradients: Mapping[str, np.ndarray]
+
+
 @dataclass(frozen=True)
 class Replicates:
     """The data and data sets drawn at a fit, the nuisances refitted to first order, and what they say at the sites.
@@ -30,8 +37,10 @@ class Replicates:
         problem, fitted, projection: where they are drawn.
         keys: one per replicate.
         raw: rows of the data (cluster, row), as if nothing had been fitted.
+        leverage: what fitting the clusters' own unknowns takes off the data's scores; `rows` and `gradients` have it back.
         rows: projected rows of the data and of the first replicates (1 + replicate, cluster, row).
         gradients: site gradients of the same, (1 + replicate, *site) by site.
+        added: what of both was added to the data's.
     """
 
     problem: Problem
@@ -39,8 +48,10 @@ class Replicates:
     projection: Projection
     keys: jax.Array
     raw: np.ndarray
+    leverage: Leverage
     rows: np.ndarray
     gradients: Mapping[str, jax.Array]
+    added: Added | None
 
     @property
     def at_sites(self) -> int:
@@ -51,6 +62,10 @@ class Replicates:
         """How many times more replicates can be taken to the sites, at most `times`; fewer where the sites are large."""
         entries = sum(g[0].size for g in self.gradients.values())
         return int(min(_MOST_VALUES / (max(self.at_sites, 1) * max(entries, 1)), times))
+
+    def site_gradients(self, rows: np.ndarray) -> dict[str, jax.Array]:
+        """Gradients (n, *site) by site of projected rows (n, cluster, row)."""
+        return _site_gradients(self.problem, self.fitted, self.projection, rows)
 
     def portions(self) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
         """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
@@ -70,18 +85,44 @@ def replicate(
         settings: how many replicates there are, and how many of them are taken to the sites.
     """
     keys = jax.random.split(key, settings.replicates)
-    raw, observed = observed_rows(problem, fitted, projection)
+    raw, own = observed_rows(problem, fitted, projection)
+    observed = projection.rows(raw[None])[0] + own.moved
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
     rows = np.concatenate([observed[None], projected])
-    gradients = problem.compiled.site_gradient(fitted.x, rows)
-    return Replicates(problem, fitted, projection, keys, raw, rows, gradients)
+    gradients = _site_gradients(problem, fitted, projection, rows)
+    added = _added(problem, fitted, projection, own) if own.sites else None
+    if added is not None:
+        gradients |= {n: gradients[n].at[0].add(parts[1:].sum(0)) for n, parts in added.gradients.items()}
+    return Replicates(problem, fitted, projection, keys, raw, own, rows, gradients, added)
 
 
-def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
-    """Rows of the data (cluster, row) as if nothing had been fitted, and projected."""
-    residual = np.asarray(problem.compiled.residual(fitted.x)) + lost_spread(problem, projection)
-    raw = projection.before_fit(residual)
-    return raw, projection.rows(raw[None])[0]
+def _added(problem: Problem, fitted: Fit, projection: Projection, own: Leverage) -> Added:
+    """By the move of the fit, whose gradients the rows give; by the slope of V; by the mean of squares."""
+    rows = np.stack([own.moved, *np.zeros((2, *own.moved.shape))])
+    moved = _site_gradients(problem, fitted, projection, own.moved[None])
+    slope, squares = own.sites[0].sites, [at.sites for at in own.sites[1:]]
+    gradients = {
+        n: np.stack([np.asarray(g)[0], slope[n], sum((at[n] for at in squares), np.zeros_like(slope[n]))])
+        for n, g in moved.items()
+    }
+    return Added(rows, gradients)
+
+
+def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, Leverage]:
+    """Rows of the data (cluster, row) as if nothing had been fitted, and what is to be added once they are projected."""
+    own = leverage(problem, fitted, projection)
+    return projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)) + own.lost), own
+
+
+def _site_gradients(
+    problem: Problem, fitted: Fit, projection: Projection, rows: np.ndarray
+) -> dict[str, jax.Array]:
+    """Gradients (n, *site) by site of rows (n, cluster, row)."""
+    gradient, centre = problem.compiled.site_gradient, projection.centre
+    if centre is None:
+        return gradient(fitted.x, rows)
+    here, there = centre.split(rows)
+    return jax.tree.map(jnp.add, gradient(fitted.x, here), gradient(centre.x, there))
 
 
 def more(drawn: Replicates, times: int) -> Replicates:
@@ -94,9 +135,9 @@ def more(drawn: Replicates, times: int) -> Replicates:
     first = drawn.at_sites
     keys = jax.random.split(jax.random.fold_in(drawn.keys[0], times), times * first)
     projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
-    observed, gradient = drawn.rows[:1], drawn.problem.compiled.site_gradient
+    observed = drawn.rows[:1]
     parts = [
-        gradient(drawn.fitted.x, np.concatenate([observed, projected[low : low + first]]))
+        drawn.site_gradients(np.concatenate([observed, projected[low : low + first]]))
         for low in range(0, len(projected), first)  # of the shape that is compiled
     ]
     gradients = {
@@ -115,7 +156,7 @@ def normal_like(drawn: Replicates) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     keys = jax.random.split(key, drawn.at_sites)
     rows = np.asarray(jax.random.normal(key, (drawn.at_sites, *drawn.raw.shape)))
     projected = drawn.projection.rows(drawn.projection.with_prior(rows, keys))
-    found = drawn.problem.compiled.site_gradient(drawn.fitted.x, np.concatenate([drawn.rows[:1], projected]))
+    found = drawn.site_gradients(np.concatenate([drawn.rows[:1], projected]))
     return projected, {name: np.asarray(g)[1:] for name, g in found.items()}
 
 

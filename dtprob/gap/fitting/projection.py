@@ -11,6 +11,7 @@ import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import activate, basis, effect_prior
+from dtprob.gap.fitting.centred import Centred, centred
 from dtprob.gap.fitting.newton import positive
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
@@ -50,6 +51,7 @@ class Projection:
         shared: what the prior knows of the global coordinates.
         own: what it knows of the local ones.
         origin: the flat vector of the fit, with what the prior knows at its centre.
+        centre: how scores are centred on the prior of the local ones, where it tells something of them.
     """
 
     columns: np.ndarray
@@ -60,6 +62,7 @@ class Projection:
     shared: Known
     own: Known
     origin: np.ndarray
+    centre: Centred | None
 
     def before_fit(self, residual: np.ndarray) -> np.ndarray:
         """Rows (cluster, row) with all coordinates back at the centre of their prior, to first order.
@@ -106,6 +109,13 @@ class Projection:
         if not own.shape[-1]:
             return w
         return w - own @ (self.local_inverse[clusters] @ (np.swapaxes(own, 1, 2) @ w))
+
+    def moved(self, shared: np.ndarray, own: np.ndarray) -> np.ndarray:
+        """Rows (cluster, row) of a Newton step for slopes of the global (global,) and local ones (cluster, local)."""
+        alone = np.einsum("cij,cj->ci", self.local_inverse, own)
+        rows = _each(self.local_columns, alone)
+        step = self.global_inverse @ (shared - np.einsum("crg,cr->g", self.columns, rows))
+        return rows + _all(self.reduced, step)
 
     def adjoint(self, e: np.ndarray) -> np.ndarray:
         """Rows P' e (..., cluster, row), whose products with columns W are those of e with P W."""
@@ -182,10 +192,16 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
         _known(slope[index], flat[index], part)
         for index, part in zip((active.global_index, active.local_index), information, strict=True)
     )
-    if problem.volume is not None:  # what a coordinate does through the clusters' own is spread, not a shift
-        centre = fitted.x.copy()
-        centre[active.local_index] -= own.deviation
-        w_global = np.asarray(problem.compiled.linearised(centre, directions[:n])[1])
+    centre = None
+    if own.spread.any():
+        centre = centred(problem, active, fitted.x, w_local, own.deviation)
+    if (
+        centre is not None or problem.volume is not None
+    ):  # what acts through the clusters' own is spread, not a shift
+        there = fitted.x.copy()
+        there[active.local_index] -= own.deviation
+        w_there = np.asarray(problem.compiled.linearised(there, directions[:n])[1])
+        w_global = w_there if centre is None else centre.columns(w_global, w_there)
     transposed = np.swapaxes(w_local, 1, 2)
     local = transposed @ w_local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
     for j in range(active.local_index.shape[1]):
@@ -201,7 +217,7 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     origin[active.global_index] -= shared.deviation
     origin[active.local_index] -= own.deviation
     origin = np.where(np.abs(origin) < _ROUNDING * np.abs(fitted.x), 0.0, origin)
-    return Projection(w_global, w_local, local_inverse, inverse, reduced, shared, own, origin)
+    return Projection(w_global, w_local, local_inverse, inverse, reduced, shared, own, origin, centre)
 
 
 def _known(slope: np.ndarray, precision: np.ndarray, information: np.ndarray) -> Known:

@@ -17,6 +17,8 @@ from dtprob.gap.observation.residuals import Parameters
 _FEW: Final = 16
 """Counts up to which a sum over counts is taken one by one."""
 _NODES: Final = np.polynomial.legendre.leggauss(24)
+_STEP: Final = 1e-3
+"""Relative step of differences, since the incomplete beta function has no derivative in its parameters."""
 
 
 def poisson_residual(p: Parameters, value: jax.Array) -> jax.Array:
@@ -35,13 +37,19 @@ def counts_deviation(p: Parameters) -> jax.Array:
 
 
 def counts_spread(p: Parameters) -> jax.Array:
+    """Root of the information on the concentration where the mean is held."""
+    return _counts_spread(p["concentration"], p["concentration"] / p["rate"])
+
+
+@jax.custom_jvp
+def _counts_spread(concentration: jax.Array, mean: jax.Array) -> jax.Array:
     """Root of the information on the concentration c where the mean m is held.
 
     It is E[psi'(c) - psi'(c + Y)] - m / (c (c + m)), the expectation the sum over k of P(Y > k) / (c + k)^2. The first k
     are taken one by one, then those that Y surely exceeds together, then those around its mean by quadrature.
     """
-    c, success = p["concentration"][..., None], 1 / (1 + p["rate"][..., None])
-    mean, deviation = c / p["rate"][..., None], counts_deviation(p)[..., None]
+    c, mean = concentration[..., None], mean[..., None]
+    success, deviation = mean / (c + mean), jnp.sqrt(mean * (c + mean) / c)
     start = _FEW - 0.5
     low = jnp.maximum(start, mean * jnp.exp(-8 * deviation / mean))
     log_low, log_high = jnp.log(low), jnp.log(jnp.maximum(low, mean + 12 * deviation) + 0.5)
@@ -55,6 +63,20 @@ def counts_spread(p: Parameters) -> jax.Array:
     whole = whole + 1 / (c + start) - 1 / (c + low)
     information = jnp.maximum(whole - mean / (c * (c + mean)), jnp.finfo(whole.dtype).eps * whole)
     return jnp.sqrt(information)[..., 0]
+
+
+@_counts_spread.defjvp
+def _counts_spread_jvp(
+    at: tuple[jax.Array, jax.Array], tangent: tuple[jax.Array, jax.Array]
+) -> tuple[jax.Array, jax.Array]:
+    concentration, mean = at
+    by_concentration = _counts_spread(concentration * (1 + _STEP), mean)
+    by_concentration -= _counts_spread(concentration * (1 - _STEP), mean)
+    by_mean = _counts_spread(concentration, mean * (1 + _STEP)) - _counts_spread(
+        concentration, mean * (1 - _STEP)
+    )
+    slope = by_concentration / concentration * tangent[0] + by_mean / mean * tangent[1]
+    return _counts_spread(concentration, mean), slope / (2 * _STEP)
 
 
 def counts_residual(p: Parameters, value: jax.Array) -> jax.Array:

@@ -24,7 +24,7 @@ _BAND: Final = 6
 _ROWS: Final = 8
 """Positions of a second axis from which rows may follow one another from cluster to cluster."""
 _COLUMNS: Final = 16
-"""Entries beside the rows up to which each is looked at."""
+"""Entries of a last axis up to which each is looked at."""
 _MOST_OF_STRETCHES: Final = 1 << 16
 """Entries of a site of which stretches are looked at."""
 
@@ -209,11 +209,12 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
     """Pooled along axes, and along curves on one axis or over a quantity."""
     for kept in _kept_axes(site.value.shape):
         yield Pattern(" x ".join(site.axes[i] for i in kept) or "common", kept)
+    last = site.value.ndim - 1
     for i, axis in enumerate(site.axes):
         for found in along(axis, site.value.shape[i]):
             yield Pattern(found.label, (i,), found)
-            if i == 0 and site.value.ndim == 2 and 1 < site.value.shape[1] <= _COLUMNS:
-                yield Pattern(f"{found.label} x {site.axes[1]}", (0, 1), found)
+            if i < last and 1 < site.value.shape[last] <= _COLUMNS:
+                yield Pattern(f"{found.label} x {site.axes[last]}", (i, last), found)
     for quantity, all_curves in over:
         if (kept := quantity.kept(site.axes, site.value.shape)) is not None:
             yield from (Pattern(found.label, kept, found) for found in all_curves)

@@ -193,16 +193,22 @@ def _test_sites(
     if ways.normal is not None:
         rows = np.concatenate([rows, ways.normal[0]])
         gradients = {n: np.concatenate([g, ways.normal[1][n]]) for n, g in gradients.items()}
+    ends = np.cumsum([len(drawn.rows), 0 if ways.normal is None else len(ways.normal[0])])
+    if drawn.added is not None:
+        rows = np.concatenate([rows, drawn.added.rows])
+        gradients = {n: np.concatenate([g, drawn.added.gradients[n]]) for n, g in gradients.items()}
     found = [deterministic(n, axes[n], ways.values[n], g) for n, g in gradients.items()]
     found += observed(problem, rows)
 
     def test(family: Family, scores: np.ndarray) -> FamilyTest:
-        own, normal = np.split(scores, [len(drawn.rows)])
-        return family_test(family, own, normal if len(normal) else None)
+        own, normal, added = np.split(scores, ends)
+        return family_test(family, own, normal if len(normal) else None, added if len(added) else None)
 
     tested = [(site, [test(*family) for family in families(ways.along, ways.over, site)]) for site in found]
     beyond: dict[str, list[FamilyTest]] = {}
-    for name, family, scores in further_moments(problem, drawn.rows):
+    centre = projection.centre
+    noise = drawn.rows if centre is None else centre.split(drawn.rows)[0]  # no tail of own unknowns' prior
+    for name, family, scores in further_moments(problem, noise):
         beyond.setdefault(name, []).append(family_test(family, scores))
     null = [test.null for tests in (*(tests for _, tests in tested), *beyond.values()) for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.effect import Context, Effect
+from dtprob.gap.fitting.centred import Centred
+from dtprob.gap.fitting.leverage import Slopes
 from dtprob.gap.model.compiled import CHUNK
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.programs import Programs
@@ -90,12 +92,14 @@ class Tangents:
         effects: in the order of the columns.
         groups: for each effect its columns.
         columns: (cluster, row, column); by far the largest array of a diagnosis, so no copy of it is made.
+        slope: what each of the slopes at sites adds to the scores of the data, (slope, column).
         extra: rows beyond the base model's, by effect name.
     """
 
     effects: tuple[Effect, ...]
     groups: tuple[np.ndarray, ...]
     columns: np.ndarray
+    slope: np.ndarray
     extra: Mapping[str, tuple[Extra, ...]]
 
 
@@ -104,27 +108,64 @@ def surroundings(problem: Problem, x: np.ndarray) -> Surroundings:
     return Surroundings(problem, x, problem.compiled.sites(x), problem.compiled.observations(x))
 
 
-def tangents(around: Surroundings, effects: Sequence[Effect], programs: Programs) -> Tangents:
-    """Whitened tangents of mean effects at their null."""
+def tangents(
+    around: Surroundings,
+    effects: Sequence[Effect],
+    programs: Programs,
+    centre: Centred | None = None,
+    slopes: Sequence[Slopes] = (),
+) -> Tangents:
+    """Whitened tangents of mean effects at their null.
+
+    Args:
+        around: the fit.
+        effects: which.
+        programs: of all candidates.
+        centre: how scores are centred on the prior of clusters' own unknowns.
+        slopes: at sites, that are added to scores; see `dtprob.gap.fitting.leverage`.
+    """
     problem = around.problem
     sizes = [e.dimension for e in effects]
     groups = tuple(np.split(np.arange(sum(sizes)), np.cumsum(sizes)[:-1])) if effects else ()
-    columns = np.zeros((*problem.rows.gather.shape, sum(sizes)))
-    found = programs.site_tangents(around.grown(), problem.effects)
     places = [(effect.name, j) for effect in effects for j in range(effect.dimension)]
+    columns = np.zeros((*problem.rows.gather.shape, len(places)))
+    found = programs.site_tangents(around.grown(), problem.effects)
+    there = None if centre is None else surroundings(problem, centre.x)
+    found_there = {} if there is None else programs.site_tangents(there.grown(), problem.effects)
     for low in range(0, len(places), CHUNK):
         part = places[low : low + CHUNK]
-        deltas = _deltas(problem, found, part)
-        if deltas:
-            shifts = np.asarray(problem.compiled.site_shift(around.x, deltas))
-            finite = np.isfinite(shifts).all(axis=(0, 1))  # an effect without a derivative here says nothing
-            columns[..., low : low + len(part)] = np.where(finite, shifts, 0.0)
+        shifts = _shifts(around, found, part)
+        if centre is not None and there is not None:
+            shifts = centre.columns(shifts, _shifts(there, found_there, part))
+        columns[..., low : low + len(part)] = shifts
+    slope = np.zeros((len(slopes), len(places)))
+    for i, at in enumerate(slopes):
+        moved = programs.site_tangents(surroundings(problem, at.x).grown(), problem.effects)
+        slope[i] = [_along(moved.get(name, {}), j, at.sites) for name, j in places]
+    slope[:, ~(np.isfinite(slope).all(axis=0) & columns.any(axis=(0, 1)))] = 0.0
     extra: dict[str, tuple[Extra, ...]] = {}
     for effect, group in zip(effects, groups, strict=True):
         rows, extra[effect.name] = _distribution_tangents(around, effect)
         if rows is not None:
             columns[..., group] += rows
-    return Tangents(tuple(effects), groups, columns, extra)
+    return Tangents(tuple(effects), groups, columns, slope, extra)
+
+
+def _shifts(
+    around: Surroundings, found: Mapping[str, Mapping[str, jax.Array]], places: Sequence[tuple[str, int]]
+) -> np.ndarray:
+    """Shifts (cluster, row, n) of some parameters; zero where there is no derivative: such an effect says nothing here."""
+    problem = around.problem
+    deltas = _deltas(problem, found, places)
+    if not deltas:
+        return np.zeros((*problem.rows.gather.shape, len(places)))
+    shifts = np.asarray(problem.compiled.site_shift(around.x, deltas))
+    return np.where(np.isfinite(shifts).all(axis=(0, 1)), shifts, 0.0)
+
+
+def _along(tangent: Mapping[str, jax.Array], j: int, slopes: Mapping[str, np.ndarray]) -> float:
+    """Slope along one parameter of an effect, of slopes at sites."""
+    return float(sum(np.sum(np.asarray(t)[..., j] * slopes[s]) for s, t in tangent.items() if s in slopes))
 
 
 def _deltas(

@@ -152,20 +152,30 @@ def _forward(
     base: fitting.Fit | None = None,
     banned: str | None = None,
 ) -> list[Step]:
-    """Steps from a fit, which may have effects already, each followed by a look at earlier choices."""
+    """Steps from a fit, which may have effects already, each followed by a look at earlier choices.
+
+    Such looks may lead in a circle, since what is given up is judged otherwise than what is taken: the one with most credit
+    is its end.
+    """
     steps: list[Step] = []
     fitted, returns = start, 0
     base = start if base is None else base
+    visited: dict[frozenset[str], View] = {}
     while True:
+        if frozenset(fitted.effects) in visited:
+            most = max(visited.values(), key=lambda view: credit(view.problem, view.fitted, base))
+            return [*steps, Step(most, Trials(most.problem, {}), None)]
         seen = _looked(problem, fitted, jax.random.fold_in(key, len(steps)), settings, say)
         little = seen.promise < settings.minor * (fitted.log_evidence - base.log_evidence)
         if little or len(fitted.effects) == settings.max_effects or not seen.alarmed(settings):
             return [*steps, Step(seen, Trials(problem, {}), None)]
+        visited[frozenset(fitted.effects)] = seen
         trials = tried(seen, settings, say, banned=banned)
         problem = trials.problem
         better = without(problem, seen.fitted, trials.fits, settings.polished) if returns < _RETURNS else None
         if better is not None:
             say("found a better fit without them: starting again from there")
+            del visited[frozenset(fitted.effects)]
             fitted, base, returns = better, base if fitted.effects else better, returns + 1
             continue
         accepted = best(seen, base, trials.fits, settings)

@@ -11,14 +11,13 @@ from scipy import stats
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting import fit as fitting
-from dtprob.gap.fitting.active import activate
+from dtprob.gap.fitting.active import activate, basis
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.integrated import based
-from dtprob.gap.fitting.leverage import lost_spread
+from dtprob.gap.fitting.leverage import leverage
 from dtprob.gap.fitting.marginal import own_mode
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.model.volume import Volume
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import view
 from dtprob.inference.laplace import Laplace
@@ -70,12 +69,11 @@ def drawn(links, readings, seed, few=()):
 def test_squares_are_lower_by_the_leverage():
     """Mean of the rows at modes of the levels, over data sets, with the noise as it is."""
     few, sets, rows = range(15), 20, 0.0
-    volume = Volume(np.zeros(2), np.zeros(30), np.zeros((30, 2)), np.zeros((30, 2, 2)))
     for seed in range(sets):
         problem = Problem(levels, drawn(30, 6, seed, few), [])
         x, _ = own_mode(problem, activate(problem), problem.start(SOUND))
         held = Fit(x, (), {}, 0.0, 0.0, np.eye(2), activate(problem).global_index, True)
-        lost = lost_spread(problem.with_volume(volume), project(problem, held))
+        lost = leverage(problem, held, project(problem, held)).lost
         rows = rows + (np.asarray(problem.compiled.residual(x)) + lost) / sets
     spreads = problem.rows.by_cluster(problem.rows.located) == 0
     for part in (range(15), range(15, 30)):
@@ -129,3 +127,97 @@ def test_scores_beside_levels_have_the_spread_that_they_claim():
         z.append(float(seen.screening.z[0]))
     low, high = stats.chi2.ppf([0.0005, 0.9995], len(z)) / len(z)
     assert low < np.mean(np.square(z)) < high
+
+
+LAWS = {
+    "Gamma": lambda mean: dist.Gamma(5.0 * jnp.ones(()), 5.0 / mean),
+    "Poisson": dist.Poisson,
+    "Normal": lambda mean: dist.Normal(mean, 2.0),
+    "LogNormal": lambda mean: dist.LogNormal(jnp.log(mean), 0.4),
+    "NegativeBinomial": lambda mean: dist.NegativeBinomial2(mean, 6.0),
+}
+
+
+def within_an_exponential(law):
+    """Levels of devices act within an exponential, of which the site is."""
+
+    def model(queue, y=None):
+        common = numpyro.sample("common", dist.Normal(2.0, 1.0))
+        slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+        with numpyro.plate("device", queue.shape[0], dim=-2):
+            own = numpyro.sample("own", dist.Normal(0.0, 0.4))
+            with numpyro.plate("packet", queue.shape[1], dim=-1):
+                mean = numpyro.deterministic("mean", jnp.exp(common + own + slope * queue))
+                numpyro.sample("y", LAWS[law](mean), obs=y)
+
+    return model
+
+
+def offset():
+    return Effect(
+        "offset",
+        {"mean": lambda value, p, context: value + p["size"] * (1 + context["queue"] ** 2)},
+        (Parameter("size", dist.Normal(0.0, 1.0)),),
+        requires=("queue",),
+    )
+
+
+def factor():
+    return Effect(
+        "factor",
+        {"mean": lambda value, p, context: value * jnp.exp(p["size"] * context["queue"] ** 2)},
+        (Parameter("size", dist.Normal(0.0, 1.0)),),
+        requires=("queue",),
+    )
+
+
+def power():
+    return Effect(
+        "power",
+        {"mean": lambda value, p, _: value * jnp.exp(p["size"] * jnp.log(value) ** 2)},
+        (Parameter("size", dist.Normal(0.0, 1.0)),),
+    )
+
+
+def waits(law, seed, devices=60, packets=8):
+    rng = np.random.default_rng(seed)
+    queue = rng.uniform(-1, 1, (devices, packets))
+    mean = np.exp(2.0 + 0.4 * rng.normal(size=(devices, 1)) + 0.5 * queue)
+    y = LAWS[law](jnp.asarray(mean)).sample(jax.random.key(seed))
+    return {"queue": jnp.asarray(queue), "y": y}
+
+
+@pytest.mark.parametrize("law", list(LAWS))
+def test_slopes_are_those_of_the_curvature_of_own_unknowns(law):
+    """Of V = -1/2 log |W' W + prior|, by finite differences along every coordinate, an effect's among them."""
+    problem = Problem(within_an_exponential(law), waits(law, 3, 5, 4), [offset()]).with_live(["offset"])
+    x = problem.start({"common": 1.8, "slope": 0.4, "own": np.linspace(-0.5, 0.5, 5)[:, None]})
+    active = activate(problem, ["offset"])
+    along = basis(problem, active)[len(active.global_index) :]
+
+    def volume(x):
+        own = np.asarray(problem.compiled.linearised(x, along)[1])
+        return -0.5 * np.linalg.slogdet(np.einsum("crl,crk->clk", own, own) + 0.4**-2)[1].sum()
+
+    own = np.asarray(problem.compiled.linearised(x, along)[1])
+    inverse = np.linalg.inv(np.einsum("crl,crk->clk", own, own) + 0.4**-2)
+    slope = -np.asarray(problem.compiled.bend(x, own @ inverse, along).x)
+    step = 1e-5
+    expected = [(volume(x + step * e) - volume(x - step * e)) / (2 * step) for e in np.eye(len(x))]
+    np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("law", list(LAWS))
+def test_scores_beside_levels_within_an_exponential_have_mean_zero(law):
+    """z of a candidate that adds to the site, and of the site itself, over data sets without it."""
+    z, p = [], []
+    for seed in range(10):
+        problem = Problem(within_an_exponential(law), waits(law, 100 + seed), [offset(), factor(), power()])
+        start = based(problem, KEY)
+        seen = view(start.problem, start.fitted, KEY, Settings(replicates=99, site_replicates=99))
+        z.append(seen.screening.z)
+        p.append(seen.location.site_p_value)
+    _, high = stats.chi2.ppf([0.0005, 0.9995], len(z)) / len(z)
+    assert (np.mean(np.square(z), axis=0) < high).all()
+    assert (np.abs(np.mean(z, axis=0)) < stats.norm.isf(0.0005) / np.sqrt(len(z))).all()
+    assert stats.binom.sf(np.sum(np.array(p) < 0.05) - 1, len(p), 0.05) > 1e-3

@@ -18,7 +18,7 @@ def _projection(n_global, n_local, *, clusters=70, rows=5):
     curvature = np.einsum("cmi,cmj->ij", shared, reduced) + np.eye(n_global)
     nothing = Known(np.zeros(n_global), np.zeros(n_global)), Known(*np.zeros((2, clusters, n_local)))
     arrays = (shared, own, inverse, np.linalg.inv(curvature), reduced)
-    return Projection(*arrays, *nothing, np.zeros(n_global))
+    return Projection(*arrays, *nothing, np.zeros(n_global), None)
 
 
 @pytest.mark.parametrize(("n_global", "n_local"), [(3, 2), (3, 0), (0, 2), (0, 0)])

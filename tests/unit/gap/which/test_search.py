@@ -2,12 +2,15 @@
 
 from types import SimpleNamespace
 
+import jax
 import numpy as np
 import pytest
 
 from dtprob.gap.settings import Settings
+from dtprob.gap.which import search
 from dtprob.gap.which.pairs import Pair
 from dtprob.gap.which.search import _promising
+from dtprob.gap.which.trials import Trials
 
 TILT_AND_NOISE, TILT_AND_SHIFT = Pair(("noise", "tilt"), 900.0), Pair(("shift", "tilt"), 880.0)
 
@@ -46,3 +49,29 @@ def test_no_pair_that_was_reached_or_promises_less_or_where_nothing_was_found(ef
 
 def test_no_pair_where_one_effect_is_all_that_is_looked_for():
     assert _promising([way(("gain",), leaves=True)], 800.0, Settings(max_effects=1)) is None
+
+
+def test_a_search_that_goes_in_a_circle_ends_where_most_credit_is(monkeypatch):
+    """Adding b gives up a, adding a gives up b: without an end where it has been, this never stops."""
+    evidence = {(): 0.0, ("a",): 5.0, ("b",): 9.0}
+
+    def fitted(*effects):
+        return SimpleNamespace(effects=effects, log_evidence=evidence[effects])
+
+    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "abc"])
+
+    def looked(problem, fitted, *_, **__):
+        return SimpleNamespace(problem=problem, fitted=fitted, promise=50.0, alarmed=lambda _: True)
+
+    def tried(seen, *_, **__):
+        new = {(): "a", ("a",): "b", ("b",): "a"}[seen.fitted.effects]
+        return Trials(problem, {new: fitted(new)})
+
+    monkeypatch.setattr(search, "_looked", looked)
+    monkeypatch.setattr(search, "tried", tried)
+    monkeypatch.setattr(search, "best", lambda seen, base, trials, settings: next(iter(trials)))
+    monkeypatch.setattr(search, "without", lambda *_: None)
+    monkeypatch.setattr(search, "_revised", lambda *_, **__: [])
+    steps = search._forward(problem, fitted(), jax.random.key(0), Settings(), lambda _: None)
+    assert [step.view.fitted.effects for step in steps] == [(), ("a",), ("b",), ("b",)]
+    assert steps[-1].accepted is None
