@@ -36,6 +36,8 @@ class Likelihood:
         relocate: (parameters, step) -> parameters whose first row is shifted by the step; None where that is not possible.
         respread: the same for the first row that is no location.
         log_scale: of families whose first rows are normal, the logarithm of the scale for a unit step of that row.
+        probability: (parameters, first row) -> probability of a smaller value, of families that are neither normal nor
+            discrete and whose first row grows with the value.
         is_outcome: whether one of a few outcomes is seen.
         is_complex: whether the first two rows are the real and the imaginary part of one.
         trailing: axes that a parameter has beyond those of the value.
@@ -50,6 +52,7 @@ class Likelihood:
     relocate: Move | None = None
     respread: Move | None = None
     log_scale: float | None = None
+    probability: Rows | None = None
     is_outcome: bool = False
     is_complex: bool = False
     trailing: Mapping[str, int] = field(default_factory=dict)
@@ -199,6 +202,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.exponential_residual,
         residuals.exponential_shift,
         relocate=_grown("rate", lambda _: -1.0),
+        probability=lambda _, row: -jnp.expm1(-jnp.maximum(1.0 + row, 0.0)),
     ),
     "Gamma": Likelihood(
         dist.Gamma,
@@ -208,6 +212,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         located=1,
         relocate=_grown("rate", lambda p: -(p["concentration"] ** -0.5)),
         respread=_at_same_mean(residuals.gamma_spread),
+        probability=residuals.gamma_probability,
     ),
     "Weibull": Likelihood(
         dist.Weibull,

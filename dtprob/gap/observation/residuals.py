@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import digamma, i0e, i1e, polygamma
+from jax.scipy.special import digamma, gammainc, i0e, i1e, polygamma
 
 from dtprob.effects.distributions import ComplexStudentT
 
@@ -151,6 +151,12 @@ def gamma_shift(p: Parameters, t: Parameters) -> jax.Array:
     a = p["concentration"]
     mean = t["concentration"] / a - t["rate"] / p["rate"]
     return jnp.stack([jnp.sqrt(a) * mean, t["concentration"] * gamma_spread(p)])
+
+
+def gamma_probability(p: Parameters, row: jax.Array) -> jax.Array:
+    """Probability of a smaller value than that of a first row."""
+    a = p["concentration"]
+    return gammainc(a, jnp.maximum(a + jnp.sqrt(a) * row, 0.0))
 
 
 def weibull_residual(p: Parameters, value: jax.Array) -> jax.Array:

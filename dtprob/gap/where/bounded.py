@@ -58,14 +58,21 @@ _TAIL: Final = _of_normal(_TAIL_ORDERS, seen=4, moved=2)
 _POWER_TAIL: Final = _of_power(_POWER_ORDERS, seen=2, moved=1)
 
 
-def skewness(row: np.ndarray) -> np.ndarray:
-    """A function of a standard normal variable, positive on average where it is skew to the right; no mean moves it."""
-    return np.tensordot(_SKEW, _basis(_SKEW_ORDERS, ndtr(row)), axes=1)
+def skewness(probability: np.ndarray) -> np.ndarray:
+    """Of a variable's probability, positive on average where it is skew to the right; no mean of a normal one moves it."""
+    return np.tensordot(_SKEW, _basis(_SKEW_ORDERS, probability), axes=1)
 
 
-def tails(row: np.ndarray) -> np.ndarray:
-    """A function of a standard normal variable, positive on average where its tails are heavy; no scale moves it."""
-    return np.tensordot(_TAIL, _basis(_TAIL_ORDERS, ndtr(row)), axes=1)
+def tails(probability: np.ndarray) -> np.ndarray:
+    """Of a variable's probability, positive on average where its tails are heavy; no scale of a normal one moves it."""
+    return np.tensordot(_TAIL, _basis(_TAIL_ORDERS, probability), axes=1)
+
+
+def beside(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Values (n, *entry) less what rows (n, component, *entry) tell of them, as learned from all but the first."""
+    told = np.moveaxis(rows[1:], 1, 0).reshape(rows.shape[1], -1)
+    weights = np.linalg.lstsq(told @ told.T, told @ values[1:].reshape(-1), rcond=None)[0]
+    return values - np.einsum("i,ni...->n...", weights, rows)
 
 
 def complex_tails(row: np.ndarray) -> np.ndarray:

@@ -208,7 +208,7 @@ def _test_sites(
     beyond: dict[str, list[FamilyTest]] = {}
     centre = projection.centre
     noise = drawn.rows if centre is None else centre.split(drawn.rows)[0]  # no tail of own unknowns' prior
-    for name, family, scores in further_moments(problem, noise):
+    for name, family, scores in further_moments(problem, fitted.x, noise):
         beyond.setdefault(name, []).append(family_test(family, scores))
     null = [test.null for tests in (*(tests for _, tests in tested), *beyond.values()) for test in tests]
     smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)

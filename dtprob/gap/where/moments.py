@@ -13,11 +13,14 @@ import itertools
 from collections.abc import Iterator
 from typing import Final
 
+import jax.numpy as jnp
 import numpy as np
+from scipy.special import ndtr
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation.likelihoods import LIKELIHOODS
-from dtprob.gap.where.bounded import complex_tails, scored, skewness, tails
+from dtprob.gap.observation.likelihoods import LIKELIHOODS, Likelihood
+from dtprob.gap.observation.residuals import Parameters
+from dtprob.gap.where.bounded import beside, complex_tails, scored, skewness, tails
 from dtprob.gap.where.families import Family, Pattern
 
 _MOST: Final = 1 << 16
@@ -36,17 +39,21 @@ def moment(family: str) -> str | None:
     return kind if kind.split(" ")[0] in _MOMENTS else None
 
 
-def further_moments(problem: Problem, rows: np.ndarray) -> Iterator[tuple[str, Family, np.ndarray]]:
+def further_moments(
+    problem: Problem, x: np.ndarray, rows: np.ndarray
+) -> Iterator[tuple[str, Family, np.ndarray]]:
     """Each observation, what of it is looked at, how that is pooled, and its scores (n, entry).
 
     Args:
         problem: the model and candidates on their data.
+        x: the fit.
         rows: projected ones (n, cluster, row), of the data first.
     """
     families = {name: LIKELIHOODS[family] for name, family in problem.families.items()}
+    every, observations = problem.by_observation(rows), problem.compiled.observations(x)
     looked = {
         name: own[:, :1] + 1j * own[:, 1:2] if families[name].is_complex else own[:, : problem.located[name]]
-        for name, own in problem.by_observation(rows).items()
+        for name, own in every.items()
         if own[0].size <= _MOST
         if families[name].is_complex or problem.located[name] == 1 or families[name].is_outcome
     }
@@ -61,7 +68,7 @@ def further_moments(problem: Problem, rows: np.ndarray) -> Iterator[tuple[str, F
         others = {
             n: r for n, r in products.items() if n > name and problem.declaration.observed[n].axes == axes
         }
-        shape = _shape(row[:, 0]) if known.log_scale is not None else ()
+        shape = _shape(known, observations[name].parameters, row[:, 0], every[name])
         for kind, values in (*shape, *_dependence(products[name], axes, others)):
             for kept in ((), *((i,) for i in range(len(axes)) if values.shape[1 + i] > 1)):
                 scores = _pooled(values, kept)
@@ -83,13 +90,21 @@ def _is_near_normal(scores: np.ndarray) -> bool:
     return bool(np.all((scores**4).mean(axis=0) < _HEAVIEST * square**2))
 
 
-def _shape(row: np.ndarray) -> Iterator[tuple[str, np.ndarray]]:
+def _shape(
+    known: Likelihood, parameters: Parameters, row: np.ndarray, every: np.ndarray
+) -> Iterator[tuple[str, np.ndarray]]:
+    """Of first rows (n, *entry); where they are not normal, beside what all rows (n, component, *entry) tell."""
     if np.iscomplexobj(row):
         yield "circularity", scored(row, is_normal=True) ** 2
         yield "tails", complex_tails(row)
-    else:
-        yield "skewness", skewness(row)
-        yield "tails", tails(row)
+    elif known.log_scale is not None:
+        yield "skewness", skewness(ndtr(row))
+        yield "tails", tails(ndtr(row))
+    elif known.probability is not None:
+        probability = np.asarray(known.probability(parameters, jnp.asarray(row)))
+        told = scored(every, is_normal=False)
+        yield "skewness", beside(skewness(probability), told)
+        yield "tails", beside(tails(probability), told)
 
 
 def _dependence(

@@ -101,12 +101,12 @@ def test_what_is_wrong_with_complex_noise_is_named(noise, expected):
 
 def test_nothing_is_noticed_where_nothing_is_wrong():
     """Each of 150 other replicates taken as the data: no more small p-values than chance lets there be."""
-    problem, _, _, drawn, _ = replicated(circular)
+    problem, fitted, _, drawn, _ = replicated(circular)
     rows = more(drawn, 4).rows[1:]
     null, data = rows[:99], rows[99:249]
     found = {}
     for row in data:
-        for name, family, scores in further_moments(problem, np.concatenate([row[None], null])):
+        for name, family, scores in further_moments(problem, fitted.x, np.concatenate([row[None], null])):
             found.setdefault((name, family.label), []).append(family_test(family, scores).p_value)
     assert len(found) == 5 * 4 - 1  # no map over the one pair of antennas
     for values in found.values():

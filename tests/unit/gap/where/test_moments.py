@@ -9,6 +9,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 from scipy import stats
+from scipy.special import ndtr
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bootstrap import more, replicate
@@ -112,14 +113,16 @@ def test_what_is_wrong_with_the_noise_is_named(noise, site, expected):
 
 def test_nothing_is_noticed_where_nothing_is_wrong():
     """Each of 120 other replicates taken as the data: family-wise, no more small p-values than chance lets there be."""
-    problem, _, _, drawn, _ = replicated(normal(0))
+    problem, fitted, _, drawn, _ = replicated(normal(0))
     rows = more(drawn, 4).rows[1:]
     null, data = rows[:199], rows[199:319]
     assert len(data) == 120
     found = []
     for row in data:
         stacked = np.concatenate([row[None], null])
-        tests = [family_test(family, scores) for _, family, scores in further_moments(problem, stacked)]
+        tests = [
+            family_test(family, scores) for _, family, scores in further_moments(problem, fitted.x, stacked)
+        ]
         assert len(tests) == 2 * 6 * 4 + 4
         smallest = np.stack([test.null for test in tests], axis=1).min(axis=1)
         found.append(family_wise(np.array([min(test.p_value for test in tests)]), smallest)[0])
@@ -150,12 +153,54 @@ def test_what_a_mean_or_a_scale_moves_does_not_count(shape):
     at, weight = np.polynomial.hermite_e.hermegauss(150)
     weight /= weight.sum()
     for moved in (1.0, at, at**2 - 1.0):
-        assert abs(np.sum(weight * moved * shape(at))) < 1e-6
+        assert abs(np.sum(weight * moved * shape(ndtr(at)))) < 1e-6
 
 
 def test_shapes_have_the_sign_that_they_say():
     rng = np.random.default_rng(2)
     right = (rng.gamma(4.0, size=100_000) - 4.0) / 2.0
-    assert abs(skewness(right).mean() + skewness(-right).mean()) < 1e-12
-    assert skewness(right).mean() > 0.1
-    assert tails(rng.standard_t(5, size=100_000) / np.sqrt(5 / 3)).mean() > 0.05
+    assert abs(skewness(ndtr(right)).mean() + skewness(ndtr(-right)).mean()) < 1e-12
+    assert skewness(ndtr(right)).mean() > 0.1
+    assert tails(ndtr(rng.standard_t(5, size=100_000) / np.sqrt(5 / 3))).mean() > 0.05
+
+
+WAITING = {
+    "Gamma": (lambda mean, shape: dist.Gamma(shape, shape / mean), stats.gamma(4.0, scale=0.25)),
+    "Exponential": (lambda mean, _: dist.Exponential(1 / mean), stats.expon()),
+}
+
+
+def waited(law, noise):
+    """The sites of a fit to readings (40, 25) that are a mean with a slope times noise."""
+    make = WAITING[law][0]
+
+    def waits(load, y=None):
+        slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+        level = numpyro.sample("level", dist.Normal(0.0, 3.0))
+        shape = numpyro.sample("shape", dist.LogNormal(1.0, 1.0))
+        with numpyro.plate("link", load.shape[0], dim=-2), numpyro.plate("time", load.shape[1], dim=-1):
+            mean = numpyro.deterministic("mean", jnp.exp(level + slope * load))
+            numpyro.sample("y", make(mean, shape), obs=y)
+
+    load = np.random.default_rng(5).normal(size=noise.shape)
+    problem = Problem(waits, {"load": load, "y": np.exp(0.3 * load) * noise}, [])
+    fitted = fitting.fit(problem, problem.null())
+    projection = project(problem, fitted)
+    drawn = replicate(problem, fitted, projection, jax.random.key(0), Settings())
+    return locate(problem, fitted, projection, drawn, Settings())
+
+
+@pytest.mark.parametrize("law", list(WAITING))
+def test_delays_of_another_law_are_noticed_by_their_shape(law):
+    """Log-normal noise with the spread of the law's logarithm."""
+    true = WAITING[law][1]
+    probability = (np.arange(1000) + 0.5) / 1000
+    spread = np.log(true.ppf(probability)).std()
+    found = waited(law, np.exp(spread * np.random.default_rng(3).normal(size=(40, 25))))
+    assert {f.moment for f in found.sites if f.p_value < 0.0025} & {"skewness", "tails"}
+
+
+@pytest.mark.parametrize("law", list(WAITING))
+def test_delays_of_their_own_law_are_not(law):
+    p = [waited(law, WAITING[law][1].rvs(size=(40, 25), random_state=seed)).site_p_value for seed in range(6)]
+    assert stats.binom.sf(np.sum(np.array(p) < 0.05) - 1, len(p), 0.05) > 1e-3
