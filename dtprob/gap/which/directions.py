@@ -165,7 +165,8 @@ def _shifts(
 
 def _along(tangent: Mapping[str, jax.Array], j: int, slopes: Mapping[str, np.ndarray]) -> float:
     """Slope along one parameter of an effect, of slopes at sites."""
-    return float(sum(np.sum(np.asarray(t)[..., j] * slopes[s]) for s, t in tangent.items() if s in slopes))
+    parts = (np.sum(np.asarray(t)[..., j] * slopes[s]) for s, t in tangent.items() if s in slopes)
+    return float(sum(np.real(part) for part in parts))
 
 
 def _deltas(

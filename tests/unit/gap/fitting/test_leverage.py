@@ -207,11 +207,11 @@ def test_slopes_are_those_of_the_curvature_of_own_unknowns(law):
     np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-6)
 
 
-@pytest.mark.parametrize("law", list(LAWS))
+@pytest.mark.parametrize("law", ["Gamma", "Poisson", "Normal"])
 def test_scores_beside_levels_within_an_exponential_have_mean_zero(law):
     """z of a candidate that adds to the site, and of the site itself, over data sets without it."""
     z, p = [], []
-    for seed in range(10):
+    for seed in range(6):
         problem = Problem(within_an_exponential(law), waits(law, 100 + seed), [offset(), factor(), power()])
         start = based(problem, KEY)
         seen = view(start.problem, start.fitted, KEY, Settings(replicates=99, site_replicates=99))

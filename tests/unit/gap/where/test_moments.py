@@ -202,5 +202,5 @@ def test_delays_of_another_law_are_noticed_by_their_shape(law):
 
 @pytest.mark.parametrize("law", list(WAITING))
 def test_delays_of_their_own_law_are_not(law):
-    p = [waited(law, WAITING[law][1].rvs(size=(40, 25), random_state=seed)).site_p_value for seed in range(6)]
+    p = [waited(law, WAITING[law][1].rvs(size=(40, 25), random_state=seed)).site_p_value for seed in range(4)]
     assert stats.binom.sf(np.sum(np.array(p) < 0.05) - 1, len(p), 0.05) > 1e-3
