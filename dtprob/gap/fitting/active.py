@@ -123,3 +123,8 @@ def basis(problem: Problem, active: Active) -> np.ndarray:
     for j in range(n_local):
         directions[n_global + j, active.local_index[:, j]] = 1.0
     return directions
+
+
+def own_basis(problem: Problem, active: Active) -> np.ndarray:
+    """Those of these directions that move local coordinates, (local, dimension)."""
+    return basis(problem, active)[len(active.global_index) :]

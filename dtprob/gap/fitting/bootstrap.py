@@ -85,8 +85,7 @@ def replicate(
         settings: how many replicates there are, and how many of them are taken to the sites.
     """
     keys = jax.random.split(key, settings.replicates)
-    raw, own = observed_rows(problem, fitted, projection)
-    observed = projection.rows(raw[None])[0] + own.moved
+    raw, observed, own = observed_rows(problem, fitted, projection)
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
     rows = np.concatenate([observed[None], projected])
     gradients = _site_gradients(problem, fitted, projection, rows)
@@ -108,10 +107,13 @@ def _added(problem: Problem, fitted: Fit, projection: Projection, own: Leverage)
     return Added(rows, gradients)
 
 
-def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, Leverage]:
-    """Rows of the data (cluster, row) as if nothing had been fitted, and what is to be added once they are projected."""
+def observed_rows(
+    problem: Problem, fitted: Fit, projection: Projection
+) -> tuple[np.ndarray, np.ndarray, Leverage]:
+    """Rows of the data (cluster, row) as if nothing had been fitted, and projected; what is added to their scores."""
     own = leverage(problem, fitted, projection)
-    return projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)) + own.lost), own
+    raw = projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)) + own.lost)
+    return raw, projection.rows(raw[None])[0] + own.moved, own
 
 
 def _site_gradients(

@@ -12,11 +12,10 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dtprob.gap.fitting.active import Active, basis
-from dtprob.gap.model.problem import Problem
+from dtprob.gap.fitting.columns import rows_of_each, scores_of_each
 
-_MOST: Final = 8
-"""Own unknowns of a cluster up to which scores are centred."""
+MOST: Final = 8
+"""Own unknowns of a cluster up to which scores are centred; more are states of a series, mostly met in a straight line."""
 
 
 class Centred(NamedTuple):
@@ -34,50 +33,24 @@ class Centred(NamedTuple):
     here: Float[np.ndarray, "cluster row own"]
     there: Float[np.ndarray, "cluster row own"]
 
+    @classmethod
+    def of(cls, x: np.ndarray, own: np.ndarray, there: np.ndarray) -> Centred:
+        """From the centre, and tangents (cluster, row, own) of clusters' own unknowns at the fit and there."""
+        return cls(x, own, per_unit(own), per_unit(there))
+
+    def without_own(self, rows: np.ndarray) -> np.ndarray:
+        """Rows (n, cluster, row) less what own unknowns could make of them."""
+        return rows - rows_of_each(self.here, scores_of_each(self.own, rows))
+
     def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (n, cluster, row) whose slopes are to be taken at the fit, and those at the centre."""
-        scores = np.einsum("ncr,crl->ncl", rows, self.own, optimize=True)
-        here, there = (
-            np.einsum("crl,ncl->ncr", part, scores, optimize=True) for part in (self.here, self.there)
-        )
-        return rows - here, there
+        found = scores_of_each(self.own, rows)
+        return rows - rows_of_each(self.here, found), rows_of_each(self.there, found)
 
     def columns(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
         """Tangents (cluster, row, k) of effects from those at the fit and those at the centre."""
         own, centre = np.swapaxes(self.here, 1, 2) @ here, np.swapaxes(self.there, 1, 2) @ there
         return here + self.own @ (centre - own)
-
-
-def centred(
-    problem: Problem,
-    active: Active,
-    x: Float[np.ndarray, " dimension"],
-    own: Float[np.ndarray, "cluster row own"],
-    deviation: Float[np.ndarray, "cluster own"],
-) -> Centred | None:
-    """How scores at a fit are centred; None where own unknowns are many, or the model is not finite at the centre.
-
-    Many are states of a series, on which sites mostly depend in a straight line.
-
-    Args:
-        problem: the model on its data.
-        active: what the fit moves.
-        x: the fit.
-        own: tangents of clusters' own unknowns there.
-        deviation: of these from the centre of their prior.
-    """
-    if own.shape[2] > _MOST:
-        return None
-    centre = x.copy()
-    centre[active.local_index] -= deviation
-    there = np.asarray(problem.compiled.linearised(centre, own_basis(problem, active))[1])
-    found = Centred(centre, own, per_unit(own), per_unit(there))
-    return found if np.isfinite(found.there).all() else None
-
-
-def own_basis(problem: Problem, active: Active) -> Float[np.ndarray, "own dimension"]:
-    """One direction per own unknown that moves it in all clusters at once."""
-    return basis(problem, active)[len(active.global_index) :]
 
 
 def per_unit(own: np.ndarray) -> np.ndarray:

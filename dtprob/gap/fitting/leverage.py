@@ -18,10 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dtprob.gap.fitting.active import Active, activate
-from dtprob.gap.fitting.centred import Centred, own_basis, per_unit
+from dtprob.gap.fitting.active import Active, activate, own_basis
+from dtprob.gap.fitting.centred import Centred, per_unit
+from dtprob.gap.fitting.columns import rows_of_each, scores, scores_of_each
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
+from dtprob.gap.model.bend import Bend
 from dtprob.gap.model.problem import Problem
 
 _STEP: Final = 0.1
@@ -65,34 +67,43 @@ def leverage(problem: Problem, fitted: Fit, projection: Projection) -> Leverage:
         return Leverage(nothing, nothing)
     active = activate(problem, fitted.effects, spread=fitted.spread)
     weights, along = own @ projection.local_inverse, own_basis(problem, active)
-    lost = _stacked(problem, problem.compiled.bend(fitted.x, weights, along).rows)
+    bend = problem.compiled.bend(fitted.x, weights, along)
+    lost = _stacked(problem, bend.rows)
     if not np.isfinite(lost).all():
         return Leverage(nothing, nothing)
-    centre = projection.centre
-    found = None if centre is None else _curved(problem, fitted, projection, active, centre)
+    centre, informed = projection.centre, projection.own.spread > 0
+    if centre is None:
+        return Leverage(lost, nothing)
+    if not informed.all():
+        weights *= informed[:, None]
+        bend = problem.compiled.bend(fitted.x, weights, along)
+    found = _curved(problem, fitted, projection, active, centre, bend=bend, weights=weights)
     return Leverage(lost, nothing) if found is None else Leverage(lost, *found)
 
 
 def _curved(
-    problem: Problem, fitted: Fit, projection: Projection, active: Active, centre: Centred
+    problem: Problem,
+    fitted: Fit,
+    projection: Projection,
+    active: Active,
+    centre: Centred,
+    *,
+    bend: Bend,
+    weights: np.ndarray,
 ) -> tuple[np.ndarray, tuple[Slopes, ...]] | None:
     """How far the fit moves and the slopes at sites, by own unknowns of which a prior tells; None if one is not finite."""
-    along = own_basis(problem, active)
-    own, spread = projection.local_columns, projection.own.spread
-    weights = (own @ projection.local_inverse) * (spread > 0)[:, None]
-    bend = problem.compiled.bend(fitted.x, weights, along)
     lost = _stacked(problem, bend.rows)
     told = problem.compiled.site_gradient(fitted.x, lost[None])
     slope = -np.asarray(bend.x)
     sites = [
         Slopes(fitted.x, {n: -np.asarray(g) - np.asarray(told[n])[0] for n, g in bend.sites.items()}),
-        *_of_moving_tangents(problem, fitted, active, weights, spread),
-        *_of_squares(problem, projection, active, centre.x, along),
+        *_of_moving_tangents(problem, fitted, active, weights, projection.own.spread),
+        *_of_squares(problem, projection, active, centre.x),
     ]
     if not all(np.isfinite(part).all() for part in (slope, *(g for at in sites for g in at.sites.values()))):
         return None
-    of_shared = slope[active.global_index] - np.einsum("crg,cr->g", projection.columns, lost)
-    of_own = slope[active.local_index] - np.einsum("crl,cr->cl", own, lost)
+    of_shared = slope[active.global_index] - scores(projection.columns, lost)
+    of_own = slope[active.local_index] - scores_of_each(projection.local_columns, lost)
     return -projection.moved(of_shared, of_own), tuple(sites)
 
 
@@ -111,7 +122,7 @@ def _of_moving_tangents(
 
 
 def _of_squares(
-    problem: Problem, projection: Projection, active: Active, centre: np.ndarray, along: np.ndarray
+    problem: Problem, projection: Projection, active: Active, centre: np.ndarray
 ) -> Iterator[Slopes]:
     """The mean of what taking scores to the centre of own unknowns' prior changes; see `dtprob.gap.fitting.centred`.
 
@@ -119,7 +130,7 @@ def _of_squares(
     their log likelihood at the mode and b = (W' W)^-1 W' J with the site's tangents J. S = P a, of a deviation a from the
     prior's centre, P the prior's precision; over clusters a a' P is 1 - H^-1 P on average, H = W' W + P.
     """
-    spread = projection.own.spread
+    spread, along = projection.own.spread, own_basis(problem, active)
     precision = np.where(spread > 0, np.where(spread > 0, spread, 1.0) ** -2.0, 0.0)
     together = np.eye(spread.shape[1]) - projection.local_inverse * precision[:, None, :]
     for k in range(spread.shape[1]):
@@ -129,7 +140,7 @@ def _of_squares(
             x = centre.copy()
             x[active.local_index[:, k]] += sign * step
             unit = per_unit(np.asarray(problem.compiled.linearised(x, along)[1]))
-            at = problem.compiled.site_gradient(x, sign * np.einsum("crl,cl->cr", unit, own)[None])
+            at = problem.compiled.site_gradient(x, sign * rows_of_each(unit, own)[None])
             yield Slopes(x, {name: np.asarray(g)[0] for name, g in at.items()})
 
 

@@ -10,8 +10,9 @@ import jax
 import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
-from dtprob.gap.fitting.active import activate, basis, effect_prior
-from dtprob.gap.fitting.centred import Centred, centred
+from dtprob.gap.fitting.active import Active, activate, basis, effect_prior
+from dtprob.gap.fitting.centred import MOST, Centred
+from dtprob.gap.fitting.columns import apart, product, rows_of, rows_of_each, scores
 from dtprob.gap.fitting.newton import positive
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
@@ -70,7 +71,11 @@ class Projection:
         A mode is drawn towards its prior, so that its residuals are not those of data whose coordinates were drawn from it:
         only after this are data and replicates alike.
         """
-        return residual + self.columns @ self.shared.deviation + _each(self.local_columns, self.own.deviation)
+        return (
+            residual
+            + self.columns @ self.shared.deviation
+            + rows_of_each(self.local_columns, self.own.deviation)
+        )
 
     def with_prior(self, rows: np.ndarray, keys: jax.Array) -> np.ndarray:
         """Rows (replicate, cluster, row) to which the prior's spread of all coordinates is added, by replicates' keys."""
@@ -78,16 +83,16 @@ class Projection:
             _normal(keys, which, part.spread.shape) * part.spread
             for which, part in enumerate((self.shared, self.own))
         )
-        return rows + _all(self.columns, shared) + _each(self.local_columns, own)
+        return rows + rows_of(self.columns, shared) + rows_of_each(self.local_columns, own)
 
     def rows(self, e: np.ndarray) -> np.ndarray:
         """Rows (..., cluster, row) after the linearised refit of all nuisances."""
-        e = e - _all(self.columns, _scores(self.reduced, e) @ self.global_inverse.T)
+        e = e - rows_of(self.columns, scores(self.reduced, e) @ self.global_inverse.T)
         return e - self._moved_alone(e)
 
     def adjust(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effect columns (cluster, row, k) after projection, and B's part that falls on the global nuisances."""
-        coefficients = self.global_inverse @ _product(self.reduced, w)
+        coefficients = self.global_inverse @ product(self.reduced, w)
         return self._without_local(w, slice(None)) - self.reduced @ coefficients, coefficients
 
     def information(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -96,11 +101,11 @@ class Projection:
         P W, the columns after projection, are made of a few clusters at a time.
         """
         parts = [slice(low, low + _TOGETHER) for low in range(0, len(w), _TOGETHER)]
-        coefficients = self.global_inverse @ _product(self.reduced, w)
+        coefficients = self.global_inverse @ product(self.reduced, w)
         found = np.zeros((w.shape[-1], w.shape[-1]))
         for c in parts:
             adjusted = self._without_local(w[c], c) - self.reduced[c] @ coefficients
-            found += _product(w[c], adjusted)
+            found += product(w[c], adjusted)
         return found, coefficients
 
     def _without_local(self, w: np.ndarray, clusters: slice) -> np.ndarray:
@@ -112,45 +117,20 @@ class Projection:
 
     def moved(self, shared: np.ndarray, own: np.ndarray) -> np.ndarray:
         """Rows (cluster, row) of a Newton step for slopes of the global (global,) and local ones (cluster, local)."""
-        alone = np.einsum("cij,cj->ci", self.local_inverse, own)
-        rows = _each(self.local_columns, alone)
-        step = self.global_inverse @ (shared - np.einsum("crg,cr->g", self.columns, rows))
-        return rows + _all(self.reduced, step)
+        rows = rows_of_each(self.local_columns, np.einsum("cij,cj->ci", self.local_inverse, own))
+        return rows + rows_of(self.reduced, self.global_inverse @ (shared - scores(self.columns, rows)))
 
     def adjoint(self, e: np.ndarray) -> np.ndarray:
         """Rows P' e (..., cluster, row), whose products with columns W are those of e with P W."""
-        return e - self._moved_alone(e) - _all(self.reduced, _scores(self.reduced, e) @ self.global_inverse.T)
+        return (
+            e - self._moved_alone(e) - rows_of(self.reduced, scores(self.reduced, e) @ self.global_inverse.T)
+        )
 
     def _moved_alone(self, e: np.ndarray) -> np.ndarray:
         """What a refit of the local coordinates alone moves of rows (..., cluster, row)."""
         own = self.local_columns
-        score = _apart(e) @ own @ np.swapaxes(self.local_inverse, 1, 2)
+        score = apart(e) @ own @ np.swapaxes(self.local_inverse, 1, 2)
         return np.moveaxis(score @ np.swapaxes(own, 1, 2), 0, -2).reshape(e.shape)
-
-
-def _scores(columns: np.ndarray, e: np.ndarray) -> np.ndarray:
-    """Products (..., i) of columns (cluster, row, i) with rows (..., cluster, row)."""
-    entries = columns.shape[0] * columns.shape[1]
-    return e.reshape(*e.shape[:-2], entries) @ columns.reshape(entries, columns.shape[-1])
-
-
-def _all(columns: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Rows (..., cluster, row) that steps (..., i) of columns (cluster, row, i) make."""
-    entries = columns.shape[0] * columns.shape[1]
-    moved = steps @ columns.reshape(entries, columns.shape[-1]).T
-    return moved.reshape(*steps.shape[:-1], *columns.shape[:-1])
-
-
-def _each(columns: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Rows (..., cluster, row) that steps (..., cluster, i) of columns (cluster, row, i) make, cluster by cluster."""
-    moved = np.moveaxis(_apart(steps) @ np.swapaxes(columns, 1, 2), 0, -2)
-    return moved.reshape(*steps.shape[:-1], columns.shape[1])
-
-
-def _apart(values: np.ndarray) -> np.ndarray:
-    """Values (..., cluster, i) as (cluster, n, i)."""
-    n = int(np.prod(values.shape[:-2], dtype=int))
-    return np.moveaxis(values, -2, 0).reshape(values.shape[-2], n, values.shape[-1])
 
 
 @partial(quick_jit, static_argnames="size")
@@ -165,12 +145,6 @@ def _normal(keys: jax.Array, which: int, shape: tuple[int, ...]) -> np.ndarray:
         return np.zeros((len(keys), *shape))
     size = max(_FEWEST_DRAWN, 1 << max(count - 1, 0).bit_length())
     return np.asarray(_standard_normal(keys, which, size))[:, :count].reshape(-1, *shape)
-
-
-def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Sum over clusters and rows of columns (cluster, row, i) times columns (cluster, row, j)."""
-    entries = left.shape[0] * left.shape[1]
-    return left.reshape(entries, left.shape[-1]).T @ right.reshape(entries, right.shape[-1])
 
 
 def project(problem: Problem, fitted: fitting.Fit) -> Projection:
@@ -192,23 +166,16 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
         _known(slope[index], flat[index], part)
         for index, part in zip((active.global_index, active.local_index), information, strict=True)
     )
-    centre = None
-    if own.spread.any():
-        centre = centred(problem, active, fitted.x, w_local, own.deviation)
-    if (
-        centre is not None or problem.volume is not None
-    ):  # what acts through the clusters' own is spread, not a shift
-        there = fitted.x.copy()
-        there[active.local_index] -= own.deviation
-        w_there = np.asarray(problem.compiled.linearised(there, directions[:n])[1])
-        w_global = w_there if centre is None else centre.columns(w_global, w_there)
+    w_global, centre = _centred(
+        problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own
+    )
     transposed = np.swapaxes(w_local, 1, 2)
     local = transposed @ w_local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
     for j in range(active.local_index.shape[1]):
         local[:, j, j] += effect_curvature[active.local_index[:, j]]
     local_inverse = np.linalg.inv(positive(local)) if local.shape[-1] else local
     reduced = w_global - w_local @ (local_inverse @ (transposed @ w_global))
-    curvature = _product(w_global, reduced)
+    curvature = product(w_global, reduced)
     curvature = (
         curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
     )
@@ -218,6 +185,29 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     origin[active.local_index] -= own.deviation
     origin = np.where(np.abs(origin) < _ROUNDING * np.abs(fitted.x), 0.0, origin)
     return Projection(w_global, w_local, local_inverse, inverse, reduced, shared, own, origin, centre)
+
+
+def _centred(
+    problem: Problem,
+    active: Active,
+    x: np.ndarray,
+    directions: np.ndarray,
+    *,
+    w_global: np.ndarray,
+    w_local: np.ndarray,
+    own: Known,
+) -> tuple[np.ndarray, Centred | None]:
+    """Tangents of the global coordinates, that go through the clusters' own as spread, not as a shift; the centre."""
+    n, wanted = w_global.shape[2], own.spread.any() and w_local.shape[2] <= MOST
+    if not wanted and problem.volume is None:
+        return w_global, None
+    there = x.copy()
+    there[active.local_index] -= own.deviation
+    w = np.asarray(problem.compiled.linearised(there, directions if wanted else directions[:n])[1])
+    if wanted and np.isfinite(w).all():
+        centre = Centred.of(there, w_local, w[..., n:])
+        return centre.columns(w_global, w[..., :n]), centre
+    return w_global if problem.volume is None else w[..., :n], None
 
 
 def _known(slope: np.ndarray, precision: np.ndarray, information: np.ndarray) -> Known:

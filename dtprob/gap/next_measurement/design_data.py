@@ -11,7 +11,7 @@ from jaxtyping import Float
 from dtprob.errors import InputError
 from dtprob.gap.diagnosis import Cause
 from dtprob.gap.evidence import Evidence
-from dtprob.gap.fitting.active import activate, basis
+from dtprob.gap.fitting.active import activate, basis, own_basis
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design import Design, Prediction, Ranked, joined, rank, recommend
@@ -147,7 +147,7 @@ def _whitening(
 ) -> Callable[[np.ndarray], np.ndarray]:
     """What makes rows (cluster, row, any) independent once clusters' own coordinates are integrated over their prior."""
     active = activate(problem, fitted.effects)
-    directions = basis(problem, active)[len(active.global_index) :]
+    directions = own_basis(problem, active)
     if not len(directions):
         return lambda rows: rows
     curvature = problem.compiled.prior(x, directions)[1]

@@ -207,7 +207,7 @@ def _test_sites(
     tested = [(site, [test(*family) for family in families(ways.along, ways.over, site)]) for site in found]
     beyond: dict[str, list[FamilyTest]] = {}
     centre = projection.centre
-    noise = drawn.rows if centre is None else centre.split(drawn.rows)[0]  # no tail of own unknowns' prior
+    noise = drawn.rows if centre is None else centre.without_own(drawn.rows)  # no tail of own unknowns' prior
     for name, family, scores in further_moments(problem, fitted.x, noise):
         beyond.setdefault(name, []).append(family_test(family, scores))
     null = [test.null for tests in (*(tests for _, tests in tested), *beyond.values()) for test in tests]

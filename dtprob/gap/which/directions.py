@@ -140,7 +140,10 @@ def tangents(
         columns[..., low : low + len(part)] = shifts
     slope = np.zeros((len(slopes), len(places)))
     for i, at in enumerate(slopes):
-        moved = programs.site_tangents(surroundings(problem, at.x).grown(), problem.effects)
+        is_here = at.x is around.x
+        moved = (
+            found if is_here else programs.site_tangents(surroundings(problem, at.x).grown(), problem.effects)
+        )
         slope[i] = [_along(moved.get(name, {}), j, at.sites) for name, j in places]
     slope[:, ~(np.isfinite(slope).all(axis=0) & columns.any(axis=(0, 1)))] = 0.0
     extra: dict[str, tuple[Extra, ...]] = {}

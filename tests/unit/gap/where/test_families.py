@@ -75,14 +75,16 @@ def test_scores_are_the_slope_along_what_a_family_perturbs(problem, shape):
     }
 
 
-def test_a_column_may_act_on_each_entry_of_a_short_second_axis_otherwise(problem):
+@pytest.mark.parametrize("users", [(), (3,)])
+def test_a_column_may_act_on_each_entry_of_a_short_last_axis_otherwise(problem, users):
     """Of two options, the odds of one rise with x as those of the other fall: a sum over options is blind to it."""
     rng = np.random.default_rng(4)
-    value, x = rng.normal(size=(LENGTH, 2)), np.asarray(problem.data["x"])
-    gradients = rng.normal(size=(60, LENGTH, 2))
-    gradients -= gradients.mean(axis=2, keepdims=True)
+    shape = (*users, LENGTH, 2)
+    value, x = rng.normal(size=shape), np.asarray(problem.data["x"])
+    gradients = rng.normal(size=(60, *shape))
+    gradients -= gradients.mean(axis=-1, keepdims=True)
     gradients[0] += 0.8 * x[:, None] * np.array([1.0, -1.0])
-    site = deterministic("utility", ("row", "option"), value, gradients)
+    site = deterministic("utility", ("user", "row", "option")[-len(shape) :], value, gradients)
     found = {f.label: family_test(f, scores) for f, scores in families(partial(curves, problem), [], site)}
     assert found["additive, along x"].p_value > 0.01
     assert found["additive, along x x option"].p_value < 1e-3
