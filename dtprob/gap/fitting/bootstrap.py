@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from typing import Final, NamedTuple
+from typing import Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.leverage import Leverage, leverage
+from dtprob.gap.fitting.leverage import lost
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -22,13 +22,6 @@ _MOST_VALUES: Final = 2e7
 """Values of sites that further replicates may hold together."""
 
 
-class Added(NamedTuple):
-    """Parts of what was added to the data's scores: rows (part, cluster, row), site gradients (part, *site) by site."""
-
-    rows: np.ndarray
-    gradients: Mapping[str, np.ndarray]
-
-
 @dataclass(frozen=True)
 class Replicates:
     """The data and data sets drawn at a fit, the nuisances refitted to first order, and what they say at the sites.
@@ -37,10 +30,8 @@ class Replicates:
         problem, fitted, projection: where they are drawn.
         keys: one per replicate.
         raw: rows of the data (cluster, row), as if nothing had been fitted.
-        leverage: what fitting the clusters' own unknowns takes off the data's scores; `rows` and `gradients` have it back.
         rows: projected rows of the data and of the first replicates (1 + replicate, cluster, row).
         gradients: site gradients of the same, (1 + replicate, *site) by site.
-        added: what of both was added to the data's.
     """
 
     problem: Problem
@@ -48,10 +39,8 @@ class Replicates:
     projection: Projection
     keys: jax.Array
     raw: np.ndarray
-    leverage: Leverage
     rows: np.ndarray
     gradients: Mapping[str, jax.Array]
-    added: Added | None
 
     @property
     def at_sites(self) -> int:
@@ -85,35 +74,18 @@ def replicate(
         settings: how many replicates there are, and how many of them are taken to the sites.
     """
     keys = jax.random.split(key, settings.replicates)
-    raw, observed, own = observed_rows(problem, fitted, projection)
+    raw, observed = observed_rows(problem, fitted, projection)
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
     rows = np.concatenate([observed[None], projected])
     gradients = _site_gradients(problem, fitted, projection, rows)
-    added = _added(problem, fitted, projection, own) if own.sites else None
-    if added is not None:
-        gradients |= {n: gradients[n].at[0].add(parts[1:].sum(0)) for n, parts in added.gradients.items()}
-    return Replicates(problem, fitted, projection, keys, raw, own, rows, gradients, added)
+    return Replicates(problem, fitted, projection, keys, raw, rows, gradients)
 
 
-def _added(problem: Problem, fitted: Fit, projection: Projection, own: Leverage) -> Added:
-    """By the move of the fit, whose gradients the rows give; by the slope of V; by the mean of squares."""
-    rows = np.stack([own.moved, *np.zeros((2, *own.moved.shape))])
-    moved = _site_gradients(problem, fitted, projection, own.moved[None])
-    slope, squares = own.sites[0].sites, [at.sites for at in own.sites[1:]]
-    gradients = {
-        n: np.stack([np.asarray(g)[0], slope[n], sum((at[n] for at in squares), np.zeros_like(slope[n]))])
-        for n, g in moved.items()
-    }
-    return Added(rows, gradients)
-
-
-def observed_rows(
-    problem: Problem, fitted: Fit, projection: Projection
-) -> tuple[np.ndarray, np.ndarray, Leverage]:
-    """Rows of the data (cluster, row) as if nothing had been fitted, and projected; what is added to their scores."""
-    own = leverage(problem, fitted, projection)
-    raw = projection.before_fit(np.asarray(problem.compiled.residual(fitted.x)) + own.lost)
-    return raw, projection.rows(raw[None])[0] + own.moved, own
+def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
+    """Rows of the data (cluster, row) as if nothing had been fitted, and projected."""
+    residual = np.asarray(problem.compiled.residual(fitted.x)) + lost(problem, fitted, projection)
+    raw = projection.before_fit(residual)
+    return raw, projection.rows(raw[None])[0]
 
 
 def _site_gradients(

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.gap.model.bend import Bend, bending
+from dtprob.gap.model.bend import bending
 from dtprob.gap.model.misses import Miss, misses
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.model.rows import stacked
@@ -153,9 +153,9 @@ class Compiled:
         return lambda x, rows: site_gradient(jnp.asarray(x), rows, self.arrays)
 
     @cached_property
-    def bend(self) -> Callable[[np.ndarray, np.ndarray, np.ndarray], Bend]:
-        """(x, weights (cluster, row, k), basis (k, dimension)) -> slopes of <weights, tangents along the basis>."""
-        run = bending(self._runner, self._float_sites)
+    def bend(self) -> Callable[[np.ndarray, np.ndarray, np.ndarray], dict[str, jax.Array]]:
+        """(x, weights (cluster, row, k), basis (k, dimension)) -> slopes by site; see `dtprob.gap.model.bend`."""
+        run = bending(self._runner)
         return lambda x, weights, basis: run(x, weights, basis, self.arrays)
 
     @cached_property

@@ -127,9 +127,3 @@ def moved(observed: Observation, step: jax.Array, *, spread: bool) -> Observatio
     known = LIKELIHOODS[observed.family]
     move = known.respread if spread else known.relocate
     return None if move is None else Observation(observed.family, move(observed.parameters, step))
-
-
-def stepped(observed: Observation, location: jax.Array, spread: jax.Array) -> Observation:
-    """The observation moved by whitened steps of its location and of its spread, as far as its family has such moves."""
-    there = moved(observed, location, spread=False) or observed
-    return moved(there, spread, spread=True) or there

@@ -7,7 +7,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dtprob.gap.fitting.leverage import DOUBT
 from dtprob.gap.tails import largest_tail, variance_ratio_tail
 from dtprob.gap.where.families import Family
 
@@ -47,9 +46,7 @@ class FamilyTest(NamedTuple):
     variance: np.ndarray
 
 
-def family_test(
-    family: Family, scores: np.ndarray, normal: np.ndarray | None = None, added: np.ndarray | None = None
-) -> FamilyTest:
+def family_test(family: Family, scores: np.ndarray, normal: np.ndarray | None = None) -> FamilyTest:
     """Test a family's squared scores (1 + replicate, entry), each entry scaled by its null variance.
 
     Their sum notices what is wrong everywhere, their largest what is wrong at a few entries of many; the p-value is the
@@ -60,12 +57,9 @@ def family_test(
         scores: of the data and of replicates.
         normal: scores (draw, entry) of the same covariance but normal, of outcomes and counts. Entries that live on
             ones so rare that the replicates do not have them are left out, what moves in few replicates counts little.
-        added: parts (part, entry) of what was added to the data's scores; their doubt counts as more variance.
     """
     first, n = scores[: 1 + CHANCE].copy(), len(scores) - 1
     total = np.einsum("ne,ne->e", scores[1:], scores[1:])
-    if added is not None:
-        first[0] *= np.sqrt(total / np.maximum(total + n * DOUBT**2 * (added**2).sum(axis=0), 1e-300))
     alive = total > 1e-12 * max(float(total.max(initial=0.0)), 1e-300)
     if normal is not None:
         alive &= total / n > _SEEN * (normal**2).mean(axis=0)
@@ -73,7 +67,7 @@ def family_test(
         return FamilyTest(family, 1.0, np.ones(n), first, total / n)
     most = np.inf if normal is None else _RARE
     summed, largest, steady = _against_the_others(scores[1:], np.where(alive, total, np.inf), most)
-    statistic, own = (n - 1) * summed, first[0, alive] ** 2 / total[alive]
+    statistic, own = (n - 1) * summed, scores[0, alive] ** 2 / total[alive]
     counted = np.where(steady[alive], own, np.minimum(own, most / n))
     p = variance_ratio_tail(
         np.append(statistic, n * counted.sum()), float(statistic.mean()), float(statistic.var()), n - 1

@@ -193,16 +193,12 @@ def _test_sites(
     if ways.normal is not None:
         rows = np.concatenate([rows, ways.normal[0]])
         gradients = {n: np.concatenate([g, ways.normal[1][n]]) for n, g in gradients.items()}
-    ends = np.cumsum([len(drawn.rows), 0 if ways.normal is None else len(ways.normal[0])])
-    if drawn.added is not None:
-        rows = np.concatenate([rows, drawn.added.rows])
-        gradients = {n: np.concatenate([g, drawn.added.gradients[n]]) for n, g in gradients.items()}
     found = [deterministic(n, axes[n], ways.values[n], g) for n, g in gradients.items()]
     found += observed(problem, rows)
 
     def test(family: Family, scores: np.ndarray) -> FamilyTest:
-        own, normal, added = np.split(scores, ends)
-        return family_test(family, own, normal if len(normal) else None, added if len(added) else None)
+        own, normal = np.split(scores, [len(drawn.rows)])
+        return family_test(family, own, normal if len(normal) else None)
 
     tested = [(site, [test(*family) for family in families(ways.along, ways.over, site)]) for site in found]
     beyond: dict[str, list[FamilyTest]] = {}

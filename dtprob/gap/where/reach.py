@@ -78,7 +78,7 @@ def reach(
         fitted: its fit with some of them; random fields among these are left out.
     """
     delta, rows = _shift(problem, base, wider, fitted), problem.rows
-    _, projected, _ = observed_rows(problem, base, projection)
+    _, projected = observed_rows(problem, base, projection)
     delta = np.where(rows.by_cluster(rows.located) == 1, delta, 0.0)
     if not np.isfinite(delta).all() or not (delta**2).any():
         return ()

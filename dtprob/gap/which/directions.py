@@ -18,7 +18,6 @@ import numpy as np
 
 from dtprob.effects.effect import Context, Effect
 from dtprob.gap.fitting.centred import Centred
-from dtprob.gap.fitting.leverage import Slopes
 from dtprob.gap.model.compiled import CHUNK
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.programs import Programs
@@ -92,14 +91,12 @@ class Tangents:
         effects: in the order of the columns.
         groups: for each effect its columns.
         columns: (cluster, row, column); by far the largest array of a diagnosis, so no copy of it is made.
-        slope: what each of the slopes at sites adds to the scores of the data, (slope, column).
         extra: rows beyond the base model's, by effect name.
     """
 
     effects: tuple[Effect, ...]
     groups: tuple[np.ndarray, ...]
     columns: np.ndarray
-    slope: np.ndarray
     extra: Mapping[str, tuple[Extra, ...]]
 
 
@@ -113,7 +110,6 @@ def tangents(
     effects: Sequence[Effect],
     programs: Programs,
     centre: Centred | None = None,
-    slopes: Sequence[Slopes] = (),
 ) -> Tangents:
     """Whitened tangents of mean effects at their null.
 
@@ -122,7 +118,6 @@ def tangents(
         effects: which.
         programs: of all candidates.
         centre: how scores are centred on the prior of clusters' own unknowns.
-        slopes: at sites, that are added to scores; see `dtprob.gap.fitting.leverage`.
     """
     problem = around.problem
     sizes = [e.dimension for e in effects]
@@ -138,20 +133,12 @@ def tangents(
         if centre is not None and there is not None:
             shifts = centre.columns(shifts, _shifts(there, found_there, part))
         columns[..., low : low + len(part)] = shifts
-    slope = np.zeros((len(slopes), len(places)))
-    for i, at in enumerate(slopes):
-        is_here = at.x is around.x
-        moved = (
-            found if is_here else programs.site_tangents(surroundings(problem, at.x).grown(), problem.effects)
-        )
-        slope[i] = [_along(moved.get(name, {}), j, at.sites) for name, j in places]
-    slope[:, ~(np.isfinite(slope).all(axis=0) & columns.any(axis=(0, 1)))] = 0.0
     extra: dict[str, tuple[Extra, ...]] = {}
     for effect, group in zip(effects, groups, strict=True):
         rows, extra[effect.name] = _distribution_tangents(around, effect)
         if rows is not None:
             columns[..., group] += rows
-    return Tangents(tuple(effects), groups, columns, slope, extra)
+    return Tangents(tuple(effects), groups, columns, extra)
 
 
 def _shifts(
@@ -164,12 +151,6 @@ def _shifts(
         return np.zeros((*problem.rows.gather.shape, len(places)))
     shifts = np.asarray(problem.compiled.site_shift(around.x, deltas))
     return np.where(np.isfinite(shifts).all(axis=(0, 1)), shifts, 0.0)
-
-
-def _along(tangent: Mapping[str, jax.Array], j: int, slopes: Mapping[str, np.ndarray]) -> float:
-    """Slope along one parameter of an effect, of slopes at sites."""
-    parts = (np.sum(np.asarray(t)[..., j] * slopes[s]) for s, t in tangent.items() if s in slopes)
-    return float(sum(np.real(part) for part in parts))
 
 
 def _deltas(

@@ -19,7 +19,6 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.bootstrap import Replicates
-from dtprob.gap.fitting.leverage import DOUBT
 from dtprob.gap.fitting.plausible import is_one_sided, log_bayes_factor, scales, sizes
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.soundness import UNSEEN
@@ -100,7 +99,7 @@ def screen(
         problem,
         projection,
         drawn,
-        tangents(around, means, problem.programs, projection.centre, drawn.leverage.sites),
+        tangents(around, means, problem.programs, projection.centre),
     )
     scores = replace(told, price=np.array([placed[e.name].price if e.name in placed else 0.0 for e in means]))
     energy = problem.programs.field_energy(around.grown(), drawn.gradients, fields) if fields else {}
@@ -177,13 +176,6 @@ class Scores:
             self.part(k) + np.diag(scales(self.effects[k]) ** -2.0), self.u[self.groups[k]]
         )
 
-    def with_added(self, added: np.ndarray) -> Scores:
-        """With parts (part, column) added to the data's scores; what they are in doubt by counts as more variance."""
-        u, doubt = self.u + added.sum(axis=0), DOUBT * np.sqrt((added**2).sum(axis=0))
-        for k, group in enumerate(self.groups):
-            u[group] /= np.sqrt(1.0 + ((doubt[group] @ self.root(k)) ** 2).sum())
-        return replace(self, u=u)
-
     @property
     def log_bayes_factor(self) -> np.ndarray:
         """Of each effect, the scale of its prior mixed, see `dtprob.gap.fitting.plausible`, its place paid for."""
@@ -225,18 +217,14 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
             information[np.ix_(group, group)] += own
             total[group] += np.diag(own)
             u[group] += extra.score(values[extra.site][None])[0]
-    added = np.stack(
-        [_products(drawn.leverage.moved, found), found.slope[:1].sum(axis=0), found.slope[1:].sum(axis=0)]
-    )
     u_null = np.concatenate([_replicate_scores(projection, found, *portion) for portion in drawn.portions()])
     information = (information + information.T) / 2
     pairs = zip(found.effects, found.groups, strict=True)
     locating = frozenset(e.name for e, g in pairs if (2 * of_location[g] > total[g]).any())
     free, coefficients = np.zeros(len(found.effects)), np.asarray(coefficients)
-    scores = Scores(
+    return Scores(
         found.effects, found.groups, u, u_null, information, total, coefficients, free, locating=locating
     )
-    return scores.with_added(added) if added.any() else scores
 
 
 def _replicate_scores(

@@ -246,7 +246,7 @@ def test_mixtures_of_receptions_stay_laws(offered, data, name, amount):
 
 
 def test_receptions_shift_all_of_a_slot_at_once_or_one_by_one(offered, data):
-    """Slots that are lost whole keep the law of what else is delivered; of further deliveries the law of any is kept."""
+    """Slots lost whole keep the law of what else is delivered; further deliveries keep the odds of one against none."""
     senders = np.asarray(data["sending"]).sum(-1)
     before, two = law(data, site="reception_logits"), senders == 2
     shift = offered["reception_shift[2_senders]"]
@@ -259,6 +259,8 @@ def test_receptions_shift_all_of_a_slot_at_once_or_one_by_one(offered, data):
     further = law(data, shift, "reception_logits", log_odds_of_any=0.0, log_odds_of_further=0.7)
     ratio = (further[two][:, 2] / further[two][:, 1]) / (before[two][:, 2] / before[two][:, 1])
     np.testing.assert_allclose(ratio, np.exp(0.7), rtol=1e-5)
+    odds = further[two][:, 1] / further[two][:, 0]
+    np.testing.assert_allclose(odds, before[two][:, 1] / before[two][:, 0], rtol=1e-5)
     assert [p.name for p in offered["reception_shift[1_senders]"].parameters] == ["log_odds_of_any"]
 
 

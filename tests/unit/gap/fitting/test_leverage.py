@@ -1,4 +1,4 @@
-"""What fitting clusters' own unknowns does to residuals: their squares, and scores beside an informative prior."""
+"""What fitting clusters' own unknowns takes off rows, and the scores beside them."""
 
 import jax
 import jax.numpy as jnp
@@ -6,15 +6,15 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
-from scipy import stats
+from scipy import special, stats
 
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting import fit as fitting
-from dtprob.gap.fitting.active import activate, basis
+from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.integrated import based
-from dtprob.gap.fitting.leverage import leverage
+from dtprob.gap.fitting.leverage import lost
 from dtprob.gap.fitting.marginal import own_mode
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.model.problem import Problem
@@ -73,8 +73,8 @@ def test_squares_are_lower_by_the_leverage():
         problem = Problem(levels, drawn(30, 6, seed, few), [])
         x, _ = own_mode(problem, activate(problem), problem.start(SOUND))
         held = Fit(x, (), {}, 0.0, 0.0, np.eye(2), activate(problem).global_index, True)
-        lost = leverage(problem, held, project(problem, held)).lost
-        rows = rows + (np.asarray(problem.compiled.residual(x)) + lost) / sets
+        taken = lost(problem, held, project(problem, held))
+        rows = rows + (np.asarray(problem.compiled.residual(x)) + taken) / sets
     spreads = problem.rows.by_cluster(problem.rows.located) == 0
     for part in (range(15), range(15, 30)):
         mean = rows[list(part)][spreads[list(part)]]
@@ -187,24 +187,37 @@ def waits(law, seed, devices=60, packets=8):
     return {"queue": jnp.asarray(queue), "y": y}
 
 
-@pytest.mark.parametrize("law", list(LAWS))
-def test_slopes_are_those_of_the_curvature_of_own_unknowns(law):
-    """Of V = -1/2 log |W' W + prior|, by finite differences along every coordinate, an effect's among them."""
-    problem = Problem(within_an_exponential(law), waits(law, 3, 5, 4), [offset()]).with_live(["offset"])
+def of_counts(mean, concentration):
+    """Root of the information that a negative binomial count has on its concentration, by enumeration."""
+    count = np.arange(2000.0)
+    probability = stats.nbinom.pmf(count, concentration, concentration / (concentration + mean))
+    score = special.digamma(count + concentration) - special.digamma(concentration)
+    score += np.log(concentration / (concentration + mean)) + (mean - count) / (concentration + mean)
+    return np.sqrt((probability * score**2).sum())
+
+
+def information(law, mean):
+    """Of one reading on the logarithm of its mean, and its slope in whitened steps of the spread."""
+    if law == "LogNormal":
+        return np.full(mean.shape, 0.4**-2), np.full(mean.shape, -np.sqrt(2) * 0.4**-2)
+    if law == "Gamma":
+        return np.full(mean.shape, 5.0), np.full(mean.shape, (special.polygamma(1, 5.0) - 1 / 5.0) ** -0.5)
+    total = 6.0 + mean
+    return mean * 6.0 / total, mean**2 / total**2 / np.vectorize(of_counts)(mean, 6.0)
+
+
+@pytest.mark.parametrize("law", ["Gamma", "LogNormal", "NegativeBinomial"])
+def test_what_is_lost_is_the_slope_of_the_curvature_of_own_unknowns(law):
+    """Of -1/2 log H, H the information on a level within an exponential and its prior's, by the closed form of each law."""
+    problem = Problem(within_an_exponential(law), waits(law, 3, 5, 4), [])
     x = problem.start({"common": 1.8, "slope": 0.4, "own": np.linspace(-0.5, 0.5, 5)[:, None]})
-    active = activate(problem, ["offset"])
-    along = basis(problem, active)[len(active.global_index) :]
-
-    def volume(x):
-        own = np.asarray(problem.compiled.linearised(x, along)[1])
-        return -0.5 * np.linalg.slogdet(np.einsum("crl,crk->clk", own, own) + 0.4**-2)[1].sum()
-
-    own = np.asarray(problem.compiled.linearised(x, along)[1])
-    inverse = np.linalg.inv(np.einsum("crl,crk->clk", own, own) + 0.4**-2)
-    slope = -np.asarray(problem.compiled.bend(x, own @ inverse, along).x)
-    step = 1e-5
-    expected = [(volume(x + step * e) - volume(x - step * e)) / (2 * step) for e in np.eye(len(x))]
-    np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-6)
+    held = Fit(x, (), {}, 0.0, 0.0, np.eye(2), activate(problem).global_index, True)
+    rows = lost(problem, held, project(problem, held))
+    own, by_spread = information(law, np.asarray(problem.compiled.sites(x)["mean"]))
+    expected = -0.5 * by_spread / (own.sum(axis=1, keepdims=True) + 0.4**-2)
+    is_location = problem.rows.by_cluster(problem.rows.located) == 1
+    np.testing.assert_allclose(rows[~is_location], expected.reshape(-1), rtol=1e-4)
+    assert (rows[is_location] == 0).all()
 
 
 @pytest.mark.parametrize("law", ["Gamma", "Poisson", "Normal"])
