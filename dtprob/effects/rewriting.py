@@ -11,15 +11,15 @@ import jax
 import jax.numpy as jnp
 import numpyro
 import numpyro.distributions as dist
-from numpyro.primitives import Messenger
 
+from dtprob.effects.changing import Changing, is_scanned
 from dtprob.effects.effect import FIELD, Context, Effect, Model
 from dtprob.errors import InputError
 
 _ADDED = "__dtprob_effects__"
 
 
-class Rewriting(Messenger):
+class Rewriting(Changing):
     """NumPyro handler that applies effects with given parameters to every site they name.
 
     Args:
@@ -53,23 +53,39 @@ class Rewriting(Messenger):
 
     def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Rewrite the value of a deterministic site, or the distribution of a sampled one."""
-        if msg["type"] not in ("deterministic", "sample"):
+        super().process_message(msg)
+        if msg["type"] != "sample":
             return
         context = Context(self._data, self._seen)
         for effect in self._effects:
-            if msg["type"] == "sample":
-                if msg["name"] in effect.distributions:
-                    given = self._given(effect, msg, context)
-                    msg["fn"] = rewritten(effect, msg["name"], msg["fn"], given, context)
-            elif msg["name"] in effect.rewrites:
+            if msg["name"] in effect.distributions:
+                if is_scanned(msg) and not msg["is_observed"]:
+                    raise InputError(
+                        f"effect {effect.name}, distribution of site {msg['name']!r} in a scan",
+                        "a site that is observed",
+                        "one that is drawn there, before the effect can act",
+                        "Give the data, or rewrite a deterministic site.",
+                    )
                 given = self._given(effect, msg, context)
-                value = rewritten(effect, msg["name"], msg["value"], given, context)
-                msg["value"] = _fit(effect.name, msg["name"], msg["value"], value)
+                msg["fn"] = rewritten(effect, msg["name"], msg["fn"], given, context)
 
-    def postprocess_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        """Remember the value, after all handlers have seen it, for later sites."""
-        if msg["type"] in ("deterministic", "sample"):
-            self._seen[msg["name"]] = msg["value"]
+    def touches(self, name: str) -> bool:
+        """Whether an effect rewrites a deterministic site."""
+        return any(name in effect.rewrites for effect in self._effects)
+
+    def change(self, msg: Mapping[str, Any]) -> Any:
+        """The value that the effects give a site, one after another."""
+        context, value = Context(self._data, self._seen), msg["value"]
+        for effect in self._effects:
+            if msg["name"] in effect.rewrites:
+                given = self._given(effect, {**msg, "value": value}, context)
+                new = rewritten(effect, msg["name"], value, given, context)
+                value = _fit(effect.name, msg["name"], value, new)
+        return value
+
+    def remember(self, msg: Mapping[str, Any]) -> None:
+        """Keep the value for later sites."""
+        self._seen[msg["name"]] = msg["value"]
 
     def _given(self, effect: Effect, msg: Mapping[str, Any], context: Context) -> Mapping[str, Any]:
         given = self._parameters[effect.name]

@@ -67,7 +67,7 @@ def diagnose(
 
     Raises:
         InputError: no effects, effects on absent sites, effects that change the model at their null, fewer than four
-            clusters, or a base model that does not fit.
+            clusters, as many unknowns that clusters share as there are data, or a base model that does not fit.
     """
     if not effects:
         raise InputError(
@@ -80,6 +80,14 @@ def diagnose(
             "at least 4 independent ones",
             f"{problem.n_cluster} along {problem.cluster_name!r}",
             "Give more links, episodes or segments, or another cluster axis.",
+        )
+    shared = sum(block.size for block in problem.blocks_of(None) if not block.local)
+    if shared >= problem.n_observation:
+        raise InputError(
+            f"latent sites without entries of their own for each of {problem.cluster_name!r}",
+            f"fewer unknowns than the {problem.n_observation} observed values",
+            str(shared),
+            "Integrate states out, with a Kalman filter say, or choose a cluster that has states of its own.",
         )
     check_nulls(problem)
     evidence = _gather(problem, key, settings, say)

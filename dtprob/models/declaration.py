@@ -14,6 +14,7 @@ from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
 from numpyro import handlers
@@ -208,7 +209,8 @@ def trace_model(
 ) -> dict[str, Any]:
     """One execution of the model: the NumPyro trace, latent sites drawn from the prior unless substituted."""
     seeded = handlers.seed(function, key)
-    replaced = handlers.substitute(seeded, data=dict(substitute or {}))
+    values = {name: jnp.asarray(value) for name, value in (substitute or {}).items()}  # a scan indexes them
+    replaced = handlers.substitute(seeded, data=values)
     return handlers.trace(replaced).get_trace(**data)
 
 
@@ -239,6 +241,9 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
     try:
         jax.eval_shape(run, arrays, jax.random.key(0))
     except NotImplementedError as error:
+        if "control flow" in str(error):
+            what, inside = f"model {model_name(function)}", "Move the plate into the function that is scanned"
+            raise InputError(what, "no scan within a plate", "one", inside) from error
         remedy = "Give every parameter a proper prior; a wide one will do"
         raise InputError(
             f"model {model_name(function)}", "distributions that can be drawn from", "one that cannot", remedy

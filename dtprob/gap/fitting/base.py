@@ -26,6 +26,8 @@ _LONG = 3
 _ENOUGH = 3
 _SAME = 0.1
 _PATIENCE = 40
+_WIDE = 128
+"""Entries of a site up to which other peaks are looked for along each; more are levels or states, not places."""
 _COMPANION = (-1.0, -0.4, 0.0, 0.4, 1.0)
 
 
@@ -143,7 +145,7 @@ def _other_peaks(
     found: list[tuple[float, np.ndarray]] = []
     offsets = np.linspace(-_REACH, _REACH, _GRID)
     blocks = [b for b in problem.blocks_of(None) if not b.local]
-    for block in (b for b in blocks if along is None or b.name in along):
+    for block in (b for b in blocks if (b.size <= _WIDE if along is None else b.name in along)):
         plates = problem.declaration.sites[block.name].plates
         others = [
             b

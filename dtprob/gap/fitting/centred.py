@@ -14,8 +14,8 @@ from jaxtyping import Float
 
 from dtprob.gap.fitting.columns import rows_of_each, scores_of_each
 
-MOST: Final = 8
-"""Own unknowns of a cluster up to which scores are centred; more are states of a series, mostly met in a straight line."""
+MOST: Final = 128
+"""Own unknowns of a cluster up to which scores are centred."""
 
 
 class Centred(NamedTuple):

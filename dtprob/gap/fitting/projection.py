@@ -28,15 +28,15 @@ _ROUNDING: Final = 1e-9
 
 
 class Known(NamedTuple):
-    """What the prior knows of some coordinates.
+    """What the prior knows of some coordinates, those of which it knows nothing where they are.
 
     Attributes:
-        deviation: of the fit from the prior's centre; 0 where the prior knows nothing.
-        spread: standard deviation of the prior; 0 where it knows nothing.
+        deviation: of the fit from the prior's centre (..., coordinate); 0 where the prior knows nothing.
+        root: of the prior's covariance (..., coordinate, coordinate); rows are 0 where it knows nothing.
     """
 
     deviation: np.ndarray
-    spread: np.ndarray
+    root: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Projection:
     def with_prior(self, rows: np.ndarray, keys: jax.Array) -> np.ndarray:
         """Rows (replicate, cluster, row) to which the prior's spread of all coordinates is added, by replicates' keys."""
         shared, own = (
-            _normal(keys, which, part.spread.shape) * part.spread
+            np.einsum("...ij,r...j->r...i", part.root, _normal(keys, which, part.deviation.shape))
             for which, part in enumerate((self.shared, self.own))
         )
         return rows + rows_of(self.columns, shared) + rows_of_each(self.local_columns, own)
@@ -114,11 +114,6 @@ class Projection:
         if not own.shape[-1]:
             return w
         return w - own @ (self.local_inverse[clusters] @ (np.swapaxes(own, 1, 2) @ w))
-
-    def moved(self, shared: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """Rows (cluster, row) of a Newton step for slopes of the global (global,) and local ones (cluster, local)."""
-        rows = rows_of_each(self.local_columns, np.einsum("cij,cj->ci", self.local_inverse, own))
-        return rows + rows_of(self.reduced, self.global_inverse @ (shared - scores(self.columns, rows)))
 
     def adjoint(self, e: np.ndarray) -> np.ndarray:
         """Rows P' e (..., cluster, row), whose products with columns W are those of e with P W."""
@@ -157,28 +152,21 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     _, effect_slope, effect_curvature = effect_prior(problem, active, fitted.x)
     w_global, w_local = np.ascontiguousarray(w[..., :n]), np.ascontiguousarray(w[..., n:])
     slope = prior_slope + effect_slope
-    flat = np.zeros(problem.dimension)
-    flat[active.global_index] = np.diag(hessian[:n][:, active.global_index])
-    flat[active.local_index] = np.einsum("jcj->cj", hessian[n:][:, active.local_index])
-    flat = flat + effect_curvature
-    information = np.einsum("cmg,cmg->g", w_global, w_global), np.einsum("cml,cml->cl", w_local, w_local)
-    shared, own = (
-        _known(slope[index], flat[index], part)
-        for index, part in zip((active.global_index, active.local_index), information, strict=True)
+    prior_global = hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
+    prior_local = np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
+    prior_local = prior_local + effect_curvature[active.local_index][..., None] * np.eye(
+        prior_local.shape[-1]
     )
+    shared = _known(slope[active.global_index], prior_global, np.einsum("cmg,cmg->g", w_global, w_global))
+    own = _known(slope[active.local_index], prior_local, np.einsum("cml,cml->cl", w_local, w_local))
     w_global, centre = _centred(
         problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own
     )
     transposed = np.swapaxes(w_local, 1, 2)
-    local = transposed @ w_local + np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
-    for j in range(active.local_index.shape[1]):
-        local[:, j, j] += effect_curvature[active.local_index[:, j]]
+    local = transposed @ w_local + prior_local
     local_inverse = np.linalg.inv(positive(local)) if local.shape[-1] else local
     reduced = w_global - w_local @ (local_inverse @ (transposed @ w_global))
-    curvature = product(w_global, reduced)
-    curvature = (
-        curvature + hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
-    )
+    curvature = product(w_global, reduced) + prior_global
     inverse = np.linalg.inv(positive(curvature)) if n else curvature
     origin = fitted.x.copy()
     origin[active.global_index] -= shared.deviation
@@ -198,7 +186,7 @@ def _centred(
     own: Known,
 ) -> tuple[np.ndarray, Centred | None]:
     """Tangents of the global coordinates, that go through the clusters' own as spread, not as a shift; the centre."""
-    n, wanted = w_global.shape[2], own.spread.any() and w_local.shape[2] <= MOST
+    n, wanted = w_global.shape[2], own.root.any() and w_local.shape[2] <= MOST
     if not wanted and problem.volume is None:
         return w_global, None
     there = x.copy()
@@ -211,7 +199,10 @@ def _centred(
 
 
 def _known(slope: np.ndarray, precision: np.ndarray, information: np.ndarray) -> Known:
-    """From slope and precision of a log prior; what the data know far better counts as not known before."""
-    informative = precision > _FAINT * information
-    safe = np.where(informative, precision, 1.0)
-    return Known(np.where(informative, -slope / safe, 0.0), np.where(informative, safe**-0.5, 0.0))
+    """From slope (..., i) and precision (..., i, i) of a log prior; what the data know far better is not known before."""
+    alone = np.eye(slope.shape[-1])
+    informative = np.einsum("...ii->...i", precision) > _FAINT * information
+    both = informative[..., :, None] & informative[..., None, :]
+    covariance = np.where(both, np.linalg.inv(positive(np.where(both, precision, alone))), 0.0)
+    root = np.where(both, np.linalg.cholesky(positive(covariance + ~informative[..., None] * alone)), 0.0)
+    return Known(-np.einsum("...ij,...j->...i", covariance, slope), root)

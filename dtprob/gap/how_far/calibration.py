@@ -83,12 +83,12 @@ class _Predicted(NamedTuple):
 def _predicted(problem: Problem, part: Fit, held: np.ndarray) -> _Predicted:
     """Errors of held-out clusters, whose own random weights are at zero, and how large they should be."""
     active = activate(problem, part.effects, spread=part.spread)
-    x, sd, drawn = _own(problem, part, active)
+    x, root, drawn = _own(problem, part, active)
     directions = basis(problem, active)
     e, w = (np.asarray(v)[held] for v in problem.compiled.linearised(x, directions))
     slope, hessian = problem.compiled.prior(x, directions)
     n, index = len(active.global_index), active.local_index[held]
-    local, random = w[..., n:][..., ~drawn], w[..., n:][..., drawn] * sd[held][:, None, drawn]
+    local, random = w[..., n:][..., ~drawn], w[..., n:][..., drawn] @ root[held][:, drawn]
     places = index[:, ~drawn]
     curvature = np.einsum("cmi,cmj->cij", local, local)
     curvature = curvature + np.moveaxis(hessian[n:][~drawn][:, places], 0, 1)
@@ -106,22 +106,23 @@ def _predicted(problem: Problem, part: Fit, held: np.ndarray) -> _Predicted:
 
 
 def _own(problem: Problem, part: Fit, active: Active) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """What clusters have of their own: a flat vector with the random ones at their centre, spreads, which are random.
+    """What clusters have of their own: a flat vector with the random ones at their centre, roots, which are random.
 
-    Effects' weights are random; of the base model those that its fit integrates out are. Spreads are (cluster, local).
+    Effects' weights are random; of the base model those that its fit integrates out are. Roots are of their
+    covariances (cluster, local, local).
     """
     x, index = part.x.copy(), active.local_index
     blocks = [b for b in active.blocks if b.local]
     weights = [0.0 if b.owner is None else part.spread[b.owner] for b in blocks]
-    sd = np.tile(np.repeat(weights, [b.size for b in blocks]), (problem.n_cluster, 1))
+    root = np.tile(np.diag(np.repeat(weights, [b.size for b in blocks])), (problem.n_cluster, 1, 1))
     base = np.repeat([b.owner is None for b in blocks], [b.size for b in blocks]).astype(bool)
     x[index[:, ~base]] = 0.0
     if problem.volume is None:
-        return x, sd, ~base
+        return x, root, ~base
     prior = project(problem, part)
     x[index[:, base]] = prior.origin[index[:, base]]
-    sd[:, base] = prior.own.spread[:, base]
-    return x, sd, ~base | (sd > 0).all(axis=0)
+    root[:, base] = prior.own.root[:, base]
+    return x, root, ~base | (np.einsum("cii->ci", root) > 0).all(axis=0)
 
 
 def _swing(problem: Problem, unknown: np.ndarray, held: np.ndarray) -> np.ndarray:

@@ -1,27 +1,56 @@
 """Models whose shared hierarchies are drawn in standard units, so that a joint mode exists.
 
 Levels a_k ~ N(mu, tau) that several clusters share have no joint mode with tau: as all a_k come together the density grows
-without bound. Of (a_k - mu) / tau it has one (Papaspiliopoulos, Roberts and Skoeld, Stat. Sci. 22 (2007) 59).
+without bound. Of (a_k - mu) / tau it has one (Papaspiliopoulos, Roberts and Skoeld, Stat. Sci. 22 (2007) 59). So it is with
+random walks, Gaussian processes and the states of a `scan`.
 """
 
 from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpyro
+import numpyro.distributions as dist
 from jax.core import Tracer
 from numpyro import handlers
 from numpyro.distributions import constraints
-from numpyro.infer.reparam import LocScaleReparam
+from numpyro.infer.reparam import LocScaleReparam, Reparam
+from numpyro.primitives import Messenger
 
 from dtprob.models.declaration import Data, Model, base_constraint, innermost, split_static, trace_model
 
 _SCALED = {"loc", "scale"}
+
+
+class _Whitened(Reparam):
+    """Draws independent standard normal numbers and makes of them what a joint normal distribution would draw."""
+
+    def __call__(self, name: str, fn: Any, obs: Any) -> tuple[None, jax.Array]:  # noqa: ARG002  (latent sites only)
+        own, batch, _ = self._unwrap(fn)
+        normal = dist.Normal(0.0, 1.0).expand((*batch, *own.event_shape)).to_event(fn.event_dim)
+        z = jnp.asarray(numpyro.sample(f"{name}_decentered", normal))
+        if isinstance(own, dist.MultivariateNormal):
+            return None, jnp.asarray(own.loc) + jnp.einsum("...ij,...j->...i", own.scale_tril, z)
+        return None, jnp.cumsum(_spread(own)[..., None] * z, axis=-1)
+
+
+class _Inside(Messenger):
+    """Redraws sites in the bodies of scans, too."""
+
+    def __init__(self, ways: Mapping[str, Reparam]) -> None:
+        super().__init__(None)
+        self._ways = ways
+
+    def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
+        if msg["type"] == "control_flow":
+            body, *rest = msg["args"]
+            msg["args"] = (handlers.reparam(body, config=dict(self._ways)), *rest)
 
 
 def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
@@ -35,13 +64,13 @@ def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
         shared: names of latent sites without entries for each cluster.
     """
     arrays, static = split_static(data)
-    ways: dict[str, LocScaleReparam] = {}
+    ways: dict[str, Reparam] = {}
 
     def spreads(key: jax.Array, arrays: Any) -> dict[str, jax.Array]:
         trace = trace_model(model, eqx.combine(arrays, static), key)
         found = {n: _way(trace[n]["fn"]) for n in shared}
         ways.update({n: way for n, way in found.items() if way is not None})
-        return {n: jnp.asarray(innermost(trace[n]["fn"]).scale) for n in ways}
+        return {n: _spread(innermost(trace[n]["fn"])) for n in ways}
 
     jax.eval_shape(spreads, jax.random.key(0), arrays)
     if not ways:
@@ -53,18 +82,26 @@ def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
 
     @functools.wraps(model)
     def drawn(*args: Any, **given: Any) -> Any:
-        with handlers.reparam(config=lambda site: ways.get(site["name"])):
+        with _Inside(ways), handlers.reparam(config=ways):
             return model(*args, **given)
 
     drawn.__signature__ = inspect.signature(model)  # pyright: ignore[reportAttributeAccessIssue]
     return drawn
 
 
-def _way(fn: Any) -> LocScaleReparam | None:
-    """How to draw from a distribution in standard units, where it has a location and a scale that something tells."""
-    names = set(innermost(fn).arg_constraints)
+def _way(fn: Any) -> Reparam | None:
+    """How to draw from a distribution in standard units, where its spread is not the same always."""
+    own = innermost(fn)
+    if isinstance(own, dist.GaussianRandomWalk | dist.MultivariateNormal):
+        return _Whitened() if isinstance(_spread(own), Tracer) else None
+    names = set(own.arg_constraints)
     if not names >= _SCALED or base_constraint(fn.support) is not constraints.real:
         return None
-    if not isinstance(innermost(fn).scale, Tracer):
+    if not isinstance(own.scale, Tracer):
         return None
     return LocScaleReparam(0.0, shape_params=sorted(names - _SCALED))
+
+
+def _spread(fn: Any) -> jax.Array:
+    """What scales a distribution."""
+    return jnp.asarray(fn.scale_tril if isinstance(fn, dist.MultivariateNormal) else fn.scale)

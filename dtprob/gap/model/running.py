@@ -10,8 +10,8 @@ from typing import Any, NamedTuple, final
 import jax
 import jax.numpy as jnp
 from numpyro import handlers
-from numpyro.primitives import Messenger
 
+from dtprob.effects.changing import Changing
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.rewriting import Rewriting
 from dtprob.gap.model.declared import Declared
@@ -22,16 +22,20 @@ from dtprob.gap.observation import whiten
 from dtprob.models.declaration import Declaration
 
 
-class _Shift(Messenger):
+class _Shift(Changing):
     """Adds a perturbation to deterministic sites."""
+
+    is_sum = True
 
     def __init__(self, deltas: Mapping[str, Any]) -> None:
         super().__init__(None)
         self._deltas = deltas
 
-    def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if msg["type"] == "deterministic" and msg["name"] in self._deltas:
-            msg["value"] = msg["value"] + self._deltas[msg["name"]]
+    def touches(self, name: str) -> bool:
+        return name in self._deltas
+
+    def change(self, msg: Mapping[str, Any]) -> Any:
+        return msg["value"] + self._deltas[msg["name"]]
 
 
 class Arrays(NamedTuple):
@@ -102,16 +106,11 @@ class Runner:
     def _run(self, x: Any, arrays: Arrays, deltas: Mapping[str, Any]) -> Outcome:
         data, declaration = self.declared.data(arrays.data), self.declared.declaration
         latent = {name: self.layout.part(x, name) for name in declaration.latent}
-        jacobians: dict[str, Any] = {}
 
         def constrain(site: dict[str, Any]) -> Any:
             if site["type"] != "sample" or site["name"] not in latent:
                 return None
-            transform = transform_of(site["fn"])
-            u = latent[site["name"]]
-            value = transform(u)
-            jacobians[site["name"]] = transform.log_abs_det_jacobian(u, value)
-            return value
+            return transform_of(site["fn"])(latent[site["name"]])
 
         with (
             handlers.trace() as trace,
@@ -125,8 +124,9 @@ class Runner:
         for name in declaration.latent:
             if name in self.known:
                 continue
-            fn = trace[name]["fn"]
-            density = fn.log_prob(trace[name]["value"]) + fold(jacobians[name], fn.batch_shape)
+            fn, value = trace[name]["fn"], trace[name]["value"]
+            jacobian = transform_of(fn).log_abs_det_jacobian(latent[name], value)
+            density = fn.log_prob(value) + fold(jacobian, fn.batch_shape)
             if name in self.own:
                 local = local + self.own[name].summed(density)
             else:

@@ -6,8 +6,10 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from numpyro.contrib.control_flow import scan
 
 from dtprob.effects.effect import Effect, Parameter
+from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting.integrated import based
 from dtprob.gap.model.decentred import decentred
@@ -127,3 +129,84 @@ def test_a_cause_beside_levels_is_told(data, cluster):
         )
         assert found.verdict == verdict
     assert found.causes[0].effects == ("bend",)
+
+
+ROOM, HOURS = 12, 20
+
+
+def drifting(load, kind, y=None):
+    """A random walk, a Gaussian process and the states of a scan, which all rooms share, each with an unknown spread."""
+    scales = {n: numpyro.sample(n, dist.HalfNormal(1.0)) for n in ("step", "size", "jump")}
+    noise = numpyro.sample("noise", dist.HalfNormal(2.0))
+    gap = jnp.arange(HOURS)[:, None] - jnp.arange(HOURS)
+    near = jnp.exp(-0.5 * (gap / 3.0) ** 2) + 1e-4 * jnp.eye(HOURS)
+    walk = numpyro.sample("walk", dist.GaussianRandomWalk(scales["step"], num_steps=HOURS))
+    curve = numpyro.sample("curve", dist.MultivariateNormal(jnp.ones(HOURS), scales["size"] ** 2 * near))
+
+    def turn(state, _):
+        state = numpyro.sample("state", dist.Normal(0.5 * state, scales["jump"]))
+        return state, state
+
+    _, states = scan(turn, 0.0, jnp.zeros(HOURS))
+    shared = {"walk": walk, "curve": curve, "state": states}[kind]
+    with numpyro.plate("room", ROOM, dim=-2), numpyro.plate("hour", HOURS, dim=-1):
+        mean = numpyro.deterministic("mean", shared - 2.0 * load)
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+
+def heavy():
+    rewrite = {"mean": lambda value, p, context: value + p["size"] * context["load"] ** 2}
+    return Effect("heavy", rewrite, (Parameter("size", dist.Normal(0.0, 3.0)),), requires=("load",))
+
+
+def of_rooms(kind, spread=0.7):
+    rng = np.random.default_rng(8)
+    steps = rng.normal(size=HOURS)
+    gap = np.subtract.outer(np.arange(HOURS), np.arange(HOURS))
+    root = np.linalg.cholesky(np.exp(-0.5 * (gap / 3.0) ** 2) + 1e-4 * np.eye(HOURS))
+    state = np.zeros(HOURS)
+    for hour in range(HOURS):
+        state[hour] = 0.5 * state[hour - 1] * (hour > 0) + spread * steps[hour]
+    shared = {"walk": spread * np.cumsum(steps), "curve": 1 + spread * root @ steps, "state": state}[kind]
+    load = rng.uniform(size=(ROOM, HOURS))
+    return {"load": load, "kind": kind, "y": shared - 2 * load + rng.normal(size=load.shape)}
+
+
+def test_what_is_drawn_jointly_is_the_same_in_standard_units():
+    """Values from their numbers, and the density less that of the numbers: the logarithm of the map's determinant."""
+    data = of_rooms("walk")
+    drawn = decentred(drifting, data, ["walk", "curve", "state"])
+    site = numpyro.handlers.trace(numpyro.handlers.seed(drawn, 3)).get_trace(**data)
+    z = {n: site[f"{n}_decentered"]["value"] for n in ("walk", "curve", "state")}
+    step, size, jump = (site[n]["value"] for n in ("step", "size", "jump"))
+    np.testing.assert_allclose(site["walk"]["value"], step * np.cumsum(z["walk"]), rtol=1e-4)
+    gap = np.subtract.outer(np.arange(HOURS), np.arange(HOURS))
+    root = np.linalg.cholesky(size**2 * (np.exp(-0.5 * (gap / 3.0) ** 2) + 1e-4 * np.eye(HOURS)))
+    np.testing.assert_allclose(site["curve"]["value"], 1 + root @ z["curve"], rtol=1e-3, atol=1e-3)
+    state = 0.0
+    for number, found in zip(z["state"], site["state"]["value"], strict=True):
+        state = 0.5 * state + jump * number
+        np.testing.assert_allclose(found, state, rtol=1e-4, atol=1e-6)
+
+
+@pytest.mark.parametrize("kind", ["walk", "curve", "state"])
+def test_what_all_clusters_share_of_a_series_is_no_gap(kind):
+    """Its joint mode with the spread would be a flat line, and every hour wrong."""
+    found = diagnose(
+        drifting, of_rooms(kind), [heavy()], cluster="room", engine=Laplace(), key=jax.random.key(0)
+    )
+    assert found.verdict == "NO_GAP"
+
+
+def test_more_unknowns_than_data_are_refused():
+    def series(load, y=None):
+        spread = numpyro.sample("spread", dist.HalfNormal(1.0))
+        with numpyro.plate("hour", len(load)):
+            level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        mean = numpyro.deterministic("mean", spread * jnp.cumsum(level))
+        with numpyro.plate("reading", len(load)):
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+    data = {"load": jnp.ones(50), "y": jnp.zeros(50)}
+    with pytest.raises(InputError, match="fewer unknowns than the 50 observed values, got 51"):
+        diagnose(series, data, [heavy()], cluster="reading", engine=Laplace(), key=jax.random.key(0))
