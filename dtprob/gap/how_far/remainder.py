@@ -113,7 +113,9 @@ def model_remainder(
 
 
 def alone(view: View) -> float:
-    """Log evidence of the fit with the one family of a site that has the most; minus infinity where none is suspected.
+    """Log evidence of the fit with the one family of a site that has the most, less the price of having picked it.
+
+    Minus infinity where none is suspected.
 
     Families of which each cluster has its own weights are left out: they follow anything.
     """
@@ -124,7 +126,7 @@ def alone(view: View) -> float:
     if not named:
         return -np.inf
     wider, fitted = _wider(view, named)
-    return max(_fitted_with(wider, fitted, name).log_evidence for name in named)
+    return max(_fitted_with(wider, fitted, name).log_evidence - s.price for name, s in named.items())
 
 
 def _named(suspects: Sequence[Suspect]) -> dict[str, Suspect]:

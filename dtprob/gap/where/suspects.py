@@ -27,6 +27,7 @@ class Suspect:
         family: what is added to the site, and how it varies.
         spread: standard deviation of the weights with the largest evidence.
         evidence: log Bayes factor of that spread against none, to first order, each weight apart.
+        price: logarithm of how many ways of varying the site it was picked from.
     """
 
     site: str
@@ -34,13 +35,15 @@ class Suspect:
     family: Family
     spread: float
     evidence: float
+    price: float
 
 
 def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
     """The families of a site that have the most evidence, ripples also narrowed to the half waves that bring it."""
     whole = [test for test in tests if test.variance.size <= _MOST_WEIGHTS]
-    found = [_suspect(site, test) for test in whole]
-    found += [_suspect(site, narrow, price) for test in whole for narrow, price in _narrowed(test)]
+    choice = float(np.log(max(len(whole), 1)))
+    found = [_suspect(site, test, choice) for test in whole]
+    found += [_suspect(site, narrow, choice, band) for test in whole for narrow, band in _narrowed(test)]
     return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
 
 
@@ -71,8 +74,10 @@ def _narrowed(test: FamilyTest) -> Iterator[tuple[FamilyTest, float]]:
     )
 
 
-def _suspect(site: Site, test: FamilyTest, price: float = 0.0) -> Suspect | None:
-    """A tested family as a suspect, if its evidence less its price speaks for it."""
+def _suspect(site: Site, test: FamilyTest, choice: float, band: float = 0.0) -> Suspect | None:
+    """A tested family as a suspect, if its evidence less the price of its band speaks for it."""
     spread, evidence = common_spread(test.first[0], test.variance)
-    evidence -= price
-    return Suspect(site.name, site.rows, test.family, spread, evidence) if evidence > 0 else None
+    evidence -= band
+    return (
+        Suspect(site.name, site.rows, test.family, spread, evidence, choice + band) if evidence > 0 else None
+    )

@@ -1,5 +1,6 @@
 """The remainder at its site: against exact regression, calibrated in simulation, honest where nothing carries over."""
 
+from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
 
@@ -15,7 +16,7 @@ from dtprob.effects.effect import FIELD
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.calibration import calibration
-from dtprob.gap.how_far.remainder import field_of, model_remainder, shortlist
+from dtprob.gap.how_far.remainder import alone, field_of, model_remainder, shortlist
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.curves import curves, quantity
 from dtprob.gap.where.families import Family, Pattern, deterministic, families
@@ -63,7 +64,7 @@ def suspect(problem, label, spread=1.0, *, site="mean", kind="additive", evidenc
     """The family of a label."""
     rows = {"location": (0,), "spread": (1,)}.get(kind)
     pattern = Pattern(label, (0,), next(c for c in curves(problem, "row", N_ROW) if c.label == label))
-    return Suspect(site, rows, Family(kind, pattern, np.ones(())), spread, evidence)
+    return Suspect(site, rows, Family(kind, pattern, np.ones(())), spread, evidence, 0.0)
 
 
 def prepared(data, model=table, cluster="street"):
@@ -148,7 +149,7 @@ def moved_as_its_families_do(problem, site, over, rng):
     """Labels of all families of a site, each of whose fields moves the site as the family's weights do."""
     seen, value = [], site.value
     for family, scores in families(partial(curves, problem), over, site):
-        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0), positive=False)
+        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0, 0.0), positive=False)
         weights = rng.normal(size=effect.shape_of_field(jnp.asarray(value), {}))
         moved = effect.rewrites["load"](value, {"scale": 2.0, FIELD: weights}, {}) - value
         assert weights.size == scores.shape[1]
@@ -249,6 +250,24 @@ def test_one_thing_under_two_names_is_tried_once():
         ]
     ]
     assert [s.site for s in shortlist(problem, pair)] == ["deviation", "mean"]
+
+
+def test_a_family_that_stands_alone_pays_for_having_been_picked():
+    problem, fitted, _, _ = prepared(rows(1, wave))
+    place, street = (
+        suspect(problem, "along place", evidence=60.0),
+        suspect(problem, "by street", evidence=50.0),
+    )
+
+    def found(*suspects):
+        location = SimpleNamespace(suspects=suspects)
+        return alone(SimpleNamespace(problem=problem, fitted=fitted, location=location))
+
+    free = found(place)
+    assert free > found(street) + 20.0
+    assert found(place, street) == pytest.approx(free, abs=1e-6)
+    assert found(replace(place, price=7.0), street) == pytest.approx(free - 7.0, abs=1e-6)
+    assert found() == -np.inf
 
 
 def test_predictions_of_a_right_model_are_calibrated():

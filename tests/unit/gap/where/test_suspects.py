@@ -35,6 +35,14 @@ def test_a_ripple_is_narrowed_to_the_half_waves_that_bring_the_evidence(ripples)
     np.testing.assert_array_equal(found[0].family.pattern.curves.values, ripples.values[5:6])
     exact = 0.5 * (64 - 1 - np.log(64)) - np.log(32 + 31 + 29 + 25 + 17)
     assert found[0].evidence == pytest.approx(exact, abs=0.1)
+    chosen = np.log(32 + 31 + 29 + 25 + 17)
+    assert [s.price for s in found] == pytest.approx([chosen, 0.0])
+
+
+def test_what_was_picked_of_many_families_costs_their_number(ripples):
+    one = FamilyTest(family_of(ripples.band(0, 1)), 0.0, np.ones(9), np.full((9, 1), 5.0), np.ones(1))
+    (first, *_) = suspects(SITE, [one] * 20)
+    assert first.price == pytest.approx(np.log(20))
 
 
 def test_a_band_of_one_half_wave_is_left_as_it_is(ripples):
