@@ -54,12 +54,16 @@ def observation(fn: Any, value: Any, name: str) -> Observation:
             own = own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
             mask = own if mask is None else mask & own
         fn = fn.base_dist
-    family = SAME.get(type(fn).__name__, type(fn).__name__)
-    if family not in LIKELIHOODS:
+    kinds = (
+        type(fn).__mro__ if type(fn).__module__.startswith("numpyro.") else [type(fn)]
+    )  # one's own may differ
+    names = (SAME.get(kind.__name__, kind.__name__) for kind in kinds)
+    family = next((known for known in names if known in LIKELIHOODS), None)
+    if family is None:
         raise InputError(
             f"observed site {name!r}",
             f"a distribution among {', '.join(LIKELIHOODS)}",
-            family,
+            type(fn).__name__,
             "Declare the observation with one of these to diagnose its gap.",
         )
     shape = jnp.shape(value)

@@ -18,6 +18,7 @@ import numpy as np
 from dtprob.gap.fitting.bootstrap import Replicates, more, normal_like
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
+from dtprob.gap.model.conditioned import conditioned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
@@ -180,7 +181,9 @@ def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
     at = problem.compiled.sites(x)
     values = {n: np.broadcast_to(np.asarray(at[n]), grown.shape) for n, grown in problem.float_sites.items()}
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    over = [(q, tuple(q.curves())) for q in _quantities(problem, values)]
+    knowing = conditioned(problem, x)
+    apart = {n: value for n, value in values.items() if n not in knowing}
+    over = [(q, tuple(q.curves())) for q in _quantities(problem, apart)]
     discrete = any(is_discrete(family) for family in problem.families.values())
     return _Ways(values, along, over, normal_like(drawn) if discrete else None)
 

@@ -385,3 +385,20 @@ def test_certain_bernoulli_stays_finite(logit):
     observed = whiten.observation(dist.Bernoulli(logits=jnp.array([logit])), value, "y")
     assert np.all(np.isfinite(whiten.residual(observed, value)))
     assert np.all(np.isfinite(whiten.shift(observed, {"logits": jnp.ones(1)})))
+
+
+def test_kinds_of_a_known_distribution_are_known_and_ones_own_are_not():
+    cuts = jnp.array([-1.0, 0.5, 2.0])
+    ordered = dist.OrderedLogistic(jnp.array([0.3, -0.2]), cuts)
+    found = whiten.observation(ordered, jnp.array([1, 3]), "y")
+    assert found.family == "CategoricalProbs"
+    np.testing.assert_allclose(
+        whiten.log_prob(found, jnp.array([1, 3])), ordered.log_prob(jnp.array([1, 3])), rtol=1e-5
+    )
+
+    class Clipped(dist.Normal):
+        def log_prob(self, value):
+            return super().log_prob(jnp.clip(value, -1.0, 1.0))
+
+    with pytest.raises(InputError, match="Clipped"):
+        whiten.observation(Clipped(0.0, 1.0), jnp.zeros(3), "y")
