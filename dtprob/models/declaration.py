@@ -95,11 +95,19 @@ class Site:
 
 @dataclass(frozen=True)
 class Declaration:
-    """The sites and axes of a model on given data, in the order of execution."""
+    """The sites and axes of a model on given data, in the order of execution.
+
+    Attributes:
+        name: of the model.
+        sites: by name.
+        cluster: the axis whose values are independent of one another.
+        factors: names of terms that `numpyro.factor` adds to the log density.
+    """
 
     name: str
     sites: Mapping[str, Site]
     cluster: str | None
+    factors: tuple[str, ...] = ()
 
     def of_kind(self, kind: Kind) -> dict[str, Site]:
         """The sites of one kind, by name."""
@@ -228,10 +236,12 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
     data = select_arguments(function, data)
     notes = metadata(function)
     found: dict[str, Site] = {}
+    factors: list[str] = []
 
     def run(arrays: dict[str, Any], key: jax.Array) -> None:
         full = eqx.combine(arrays, static)
         trace = trace_model(function, full, key)
+        factors.extend(name for name, message in trace.items() if is_factor(message))
         for name, message in trace.items():
             site = _site(message, notes, full)
             if site is not None:
@@ -248,7 +258,9 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
         raise InputError(
             f"model {model_name(function)}", "distributions that can be drawn from", "one that cannot", remedy
         ) from error
-    declaration = Declaration(model_name(function), found, cluster or notes.cluster or _first_plate(found))
+    declaration = Declaration(
+        model_name(function), found, cluster or notes.cluster or _first_plate(found), tuple(factors)
+    )
     if not declaration.observed:
         raise InputError(
             f"model {declaration.name}",
@@ -264,6 +276,11 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
     return declaration
 
 
+def is_factor(message: Mapping[str, Any]) -> bool:
+    """Whether a site of a trace is a term that `numpyro.factor` adds to the log density."""
+    return message["type"] == "sample" and isinstance(message["fn"], numpyro.distributions.Unit)
+
+
 def _first_plate(sites: Mapping[str, Site]) -> str | None:
     for site in sites.values():
         if site.kind == "observed" and site.plates:
@@ -276,7 +293,7 @@ def _site(message: Mapping[str, Any], notes: Metadata, data: Data) -> Site | Non
         kind: Kind = "deterministic"
     elif message["type"] == "sample" and isinstance(message["fn"], numpyro.distributions.Distribution):
         kind = "observed" if message["is_observed"] else "latent"
-        if isinstance(message["fn"], numpyro.distributions.Unit):
+        if is_factor(message):
             return None
     else:
         return None

@@ -68,6 +68,12 @@ def _counted(bad: np.ndarray) -> str:
 def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
     """What a reader should know of the fit of the base model, one sentence each; nothing where all is well."""
     found = [] if fitted.converged else ["the fit of the base model had not converged"]
+    if problem.declaration.factors:
+        names = ", ".join(problem.declaration.factors)
+        remedy = "give what is observed a distribution, if it is data"
+        found.append(
+            f"what numpyro.factor adds ({names}) counts as a prior, and no gap is looked for in it; {remedy}"
+        )
     return (*found, *_misfit(problem, fitted), *_undetermined(problem, fitted))
 
 

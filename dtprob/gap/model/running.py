@@ -57,7 +57,7 @@ class Outcome(NamedTuple):
         sites: values of the latent and deterministic sites.
         values: of the observed ones, the data.
         parameters: of the observed distributions.
-        prior: log prior of the global base latents.
+        prior: log prior of the global base latents, and what `numpyro.factor` adds.
         local: log prior of the local ones, per cluster.
     """
 
@@ -131,6 +131,8 @@ class Runner:
                 local = local + self.own[name].summed(density)
             else:
                 total = total + jnp.sum(density)
+        for name in declaration.factors:
+            total = total + jnp.sum(trace[name]["fn"].log_prob(trace[name]["value"]))
         names = [*declaration.latent, *declaration.deterministic]
         observed = observations(declaration, trace)
         return Outcome(

@@ -54,6 +54,13 @@ def improper(x, y=None):
     observed(numpyro.sample("a", dist.ImproperUniform(dist.constraints.real, (), ())) + x, y, x)
 
 
+def tied(x, y=None):
+    """Two levels of which the data see the sum, and a term that ties them together."""
+    floor, ceiling = (numpyro.sample(name, dist.Normal(0.0, 3.0)) for name in ("floor", "ceiling"))
+    numpyro.factor("alike", -50.0 * (floor - ceiling) ** 2)
+    observed(floor + ceiling + 0 * x, y, x)
+
+
 def noted(model, data, effects=()):
     problem = Problem(model, data, effects or [bend()])
     return notes(problem, fit_base(problem, jax.random.key(0), starts=1, polished=0))
@@ -74,6 +81,18 @@ def test_absorbed_parameters_are_named():
     assert "the data tell nothing about unseen" in found
     assert any("only a combination of floor, ceiling;" in note for note in found)
     assert not any("slope" in note for note in found)
+
+
+def test_factors_are_a_prior_and_the_reader_is_told():
+    data = {"x": np.ones((12, 6)), "y": np.full((12, 6), 3.0)}
+    problem = Problem(tied, data, [bend()])
+    fitted = fit_base(problem, jax.random.key(0), starts=1, polished=0)
+    precision, tie = 72 / 0.5**2, 100.0
+    curvature = precision * np.ones((2, 2)) + np.eye(2) / 9 + tie * np.array([[1, -1], [-1, 1]])
+    np.testing.assert_allclose(fitted.covariance, np.linalg.inv(curvature), rtol=1e-4)
+    assert [
+        line for line in notes(problem, fitted) if "numpyro.factor adds (alike) counts as a prior" in line
+    ]
 
 
 def test_no_fit_at_all():
