@@ -216,7 +216,7 @@ def test_what_is_lost_is_the_slope_of_the_curvature_of_own_unknowns(law):
     own, by_spread = information(law, np.asarray(problem.compiled.sites(x)["mean"]))
     expected = -0.5 * by_spread / (own.sum(axis=1, keepdims=True) + 0.4**-2)
     is_location = problem.rows.by_cluster(problem.rows.located) == 1
-    np.testing.assert_allclose(rows[~is_location], expected.reshape(-1), rtol=1e-4)
+    np.testing.assert_allclose(rows[~is_location], expected.reshape(-1), rtol=1e-3)  # of a quadrature
     assert (rows[is_location] == 0).all()
 
 
