@@ -39,12 +39,11 @@ class Changing(Messenger):
 
     def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
         """Change a deterministic site's value."""
-        if msg["type"] == "control_flow":
-            if msg["fn"] is scan_wrapper:
+        if is_scan(msg):
+            if _OWN not in msg:
                 msg[_OWN] = []
                 msg["fn"] = partial(_changed, msg[_OWN])
-            if _OWN in msg:
-                msg[_OWN].append(self)
+            msg[_OWN].append(self)
         elif msg["type"] == "deterministic" and not is_scanned(msg) and self.touches(msg["name"]):
             msg["value"] = self.change(msg)
 
@@ -54,21 +53,36 @@ class Changing(Messenger):
             self.remember(msg)
 
 
-def is_scanned(msg: Mapping[str, Any]) -> bool:
-    """Whether a site is told of after its `scan` has run."""
-    return msg.get("_control_flow_done", False)
+class Shift(Changing):
+    """Adds to deterministic sites.
 
+    Args:
+        added: what, by the site's name.
+    """
 
-class _Added(Messenger):
-    """Adds to deterministic sites."""
+    is_sum = True
 
     def __init__(self, added: Mapping[str, Any]) -> None:
         super().__init__(None)
         self._added = added
 
-    def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if msg["type"] == "deterministic" and msg["name"] in self._added:
-            msg["value"] = msg["value"] + self._added[msg["name"]]
+    def touches(self, name: str) -> bool:
+        """Whether something is added to a site."""
+        return name in self._added
+
+    def change(self, msg: Mapping[str, Any]) -> Any:
+        """The value with what is added."""
+        return msg["value"] + self._added[msg["name"]]
+
+
+def is_scan(msg: Mapping[str, Any]) -> bool:
+    """Whether a `scan` is about to run; a `cond` is another kind of control flow."""
+    return msg["type"] == "control_flow" and (msg["fn"] is scan_wrapper or _OWN in msg)
+
+
+def is_scanned(msg: Mapping[str, Any]) -> bool:
+    """Whether a site is told of after its `scan` has run."""
+    return msg.get("_control_flow_done", False)
 
 
 def _changed(
@@ -79,28 +93,32 @@ def _changed(
     def scanned(added: Mapping[str, Any]) -> Any:
         def step(carry: Any, x: Any) -> Any:
             own, now = x
-            with _Added(now):
+            with Shift(now):
                 return body(carry, own)
 
         return scan_wrapper(step, init, (xs, dict(added)), *settings, **how)
 
     sites = _sites(jax.eval_shape(scanned, {}))
-    touched = [n for n, m in sites.items() if m["type"] == "deterministic" and _of(handlers, n)]
-    moving = [n for n in touched if not all(h.is_sum for h in _of(handlers, n))]
-    nothing = {n: jnp.zeros(sites[n]["value"].shape, sites[n]["value"].dtype) for n in touched}
-    added = {n: _final([h for h in _of(handlers, n) if h.is_sum], sites[n], z) for n, z in nothing.items()}
-    for _ in range(len(moving) + 1 if moving else 0):
-        added = _additions(handlers, _sites(scanned(added)), added)
+    acting = {
+        name: [handler for handler in handlers if handler.touches(name)]
+        for name, msg in sites.items()
+        if msg["type"] == "deterministic"
+    }
+    acting = {name: those for name, those in acting.items() if those}
+    added: dict[str, Any] = {}
+    for name, those in acting.items():
+        value = sites[name]["value"]
+        sums = [handler for handler in those if handler.is_sum]
+        added[name] = _final(sums, sites[name], jnp.zeros(value.shape, value.dtype))
+    moving = sum(not all(handler.is_sum for handler in those) for those in acting.values())
+    for _ in range(moving + 1 if moving else 0):
+        added = _additions(handlers, acting, _sites(scanned(added)), added)
     return scanned(added)
 
 
 def _sites(result: Any) -> dict[str, Any]:
     """The messages of the sites in what `scan_wrapper` returns."""
     return result[1][0].trace
-
-
-def _of(handlers: Sequence[Changing], name: str) -> list[Changing]:
-    return [handler for handler in handlers if handler.touches(name)]
 
 
 def _final(handlers: Sequence[Changing], msg: Mapping[str, Any], value: Any) -> Any:
@@ -110,15 +128,18 @@ def _final(handlers: Sequence[Changing], msg: Mapping[str, Any], value: Any) -> 
 
 
 def _additions(
-    handlers: Sequence[Changing], sites: Mapping[str, Any], added: Mapping[str, Any]
+    handlers: Sequence[Changing],
+    acting: Mapping[str, Sequence[Changing]],
+    sites: Mapping[str, Any],
+    added: Mapping[str, Any],
 ) -> dict[str, Any]:
     """What the handlers add to each series, given the series with what was added before."""
     found = {}
     for name, msg in sites.items():
         value = msg["value"]
-        if name in added:
+        if name in acting:
             before = value - added[name]
-            value = _final(_of(handlers, name), msg, before)
+            value = _final(acting[name], msg, before)
             found[name] = value - before
         if msg["type"] in ("deterministic", "sample"):
             for handler in handlers:

@@ -115,9 +115,8 @@ def model_remainder(
 def alone(view: View) -> float:
     """Log evidence of the fit with the one family of a site that has the most, less the price of having picked it.
 
-    Minus infinity where none is suspected.
-
-    Families of which each cluster has its own weights are left out: they follow anything.
+    Minus infinity where none is suspected. Families of which each cluster has its own weights are left out: they follow
+    anything.
     """
     problem = view.problem
     shared = [s for s in view.location.suspects if not _is_per_cluster(problem, s)]

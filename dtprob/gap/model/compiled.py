@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from functools import cached_property, partial
+from types import MappingProxyType
 from typing import Any, Final, NamedTuple, final
 
 import jax
@@ -127,12 +128,7 @@ class Compiled:
     def replicate(self, x: np.ndarray, keys: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Whitened residuals (n, cluster, row) and observed values (n, ...) by site, drawn at x with keys (n,)."""
         families = tuple(self._runner.families.items())
-        return _replicate(
-            self._state(jnp.asarray(x), self.arrays).observed,
-            keys,
-            self._runner.rows.gather,
-            families=families,
-        )
+        return _replicate(self._state(x).observed, keys, self._runner.rows.gather, families=families)
 
     @cached_property
     def site_gradient(self) -> Any:
@@ -225,28 +221,29 @@ class Compiled:
         return {n: jnp.zeros((CHUNK, *s.shape), s.dtype) for n, s in self._float_sites.items()}
 
     @cached_property
-    def _state(self) -> Callable[[Any, Arrays], _State]:
+    def _state(self) -> Callable[..., _State]:
         @quick_jit
         def state(x: Any, arrays: Any) -> _State:
             found = self._runner.run(x, arrays, {})
             data = self._runner.declared.data(arrays.data)
             return _State(found.sites, found.parameters, misses(self._runner, found, data))
 
-        return state
+        def at(x: np.ndarray, given: Mapping[str, Any] = MappingProxyType({})) -> _State:
+            return state(jnp.asarray(x), self.arrays._replace(data={**self.arrays.data, **given}))
 
-    def sites(self, x: np.ndarray, given: Mapping[str, Any] | None = None) -> dict[str, jax.Array]:
+        return at
+
+    def sites(self, x: np.ndarray, given: Mapping[str, Any] = MappingProxyType({})) -> dict[str, jax.Array]:
         """Values of the latent and deterministic sites at x, by name; `given` replaces arguments of the model."""
-        return self._state(
-            jnp.asarray(x), self.arrays._replace(data={**self.arrays.data, **(given or {})})
-        ).sites
+        return self._state(x, given).sites
 
     def observations(self, x: np.ndarray) -> dict[str, whiten.Observation]:
         """The observed distributions at x, by site."""
-        return self._runner.around(self._state(jnp.asarray(x), self.arrays).observed)
+        return self._runner.around(self._state(x).observed)
 
     def misses(self, x: np.ndarray) -> dict[str, Miss]:
         """How far predictions at x miss what was seen, by observed site and measure."""
-        return self._state(jnp.asarray(x), self.arrays).misses
+        return self._state(x).misses
 
     @cached_property
     def prior(self) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from numpyro import handlers
 
-from dtprob.effects.changing import Changing
+from dtprob.effects.changing import Shift
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.rewriting import Rewriting
 from dtprob.gap.model.declared import Declared
@@ -20,22 +20,6 @@ from dtprob.gap.model.own import Own
 from dtprob.gap.model.rows import Rows
 from dtprob.gap.observation import whiten
 from dtprob.models.declaration import Declaration
-
-
-class _Shift(Changing):
-    """Adds a perturbation to deterministic sites."""
-
-    is_sum = True
-
-    def __init__(self, deltas: Mapping[str, Any]) -> None:
-        super().__init__(None)
-        self._deltas = deltas
-
-    def touches(self, name: str) -> bool:
-        return name in self._deltas
-
-    def change(self, msg: Mapping[str, Any]) -> Any:
-        return msg["value"] + self._deltas[msg["name"]]
 
 
 class Arrays(NamedTuple):
@@ -114,7 +98,7 @@ class Runner:
 
         with (
             handlers.trace() as trace,
-            _Shift(deltas),
+            Shift(deltas),
             Rewriting(None, self.live, self._parameters(x), data),
             handlers.substitute(substitute_fn=constrain),
             handlers.seed(rng_seed=jax.random.key(0)),
