@@ -23,6 +23,7 @@ from numpyro.distributions import constraints
 from numpyro.infer.reparam import LocScaleReparam, Reparam
 from numpyro.primitives import Messenger
 
+from dtprob.effects.changing import is_scan
 from dtprob.models.declaration import Data, Model, base_constraint, innermost, split_static, trace_model
 
 _SCALED = {"loc", "scale"}
@@ -48,7 +49,7 @@ class _Inside(Messenger):
         self._ways = ways
 
     def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if msg["type"] == "control_flow":
+        if is_scan(msg):
             body, *rest = msg["args"]
             msg["args"] = (handlers.reparam(body, config=dict(self._ways)), *rest)
 

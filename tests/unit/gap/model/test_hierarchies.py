@@ -6,7 +6,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
-from numpyro.contrib.control_flow import scan
+from numpyro.contrib.control_flow import cond, scan
 
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.errors import InputError
@@ -187,6 +187,30 @@ def test_what_is_drawn_jointly_is_the_same_in_standard_units():
     for number, found in zip(z["state"], site["state"]["value"], strict=True):
         state = 0.5 * state + jump * number
         np.testing.assert_allclose(found, state, rtol=1e-4, atol=1e-6)
+
+
+def test_other_control_flow_is_left_as_it_is():
+    def told(value, _):
+        return numpyro.deterministic("sign", value)
+
+    def branching(load, kind, y=None):
+        size = numpyro.sample("size", dist.HalfNormal(1.0))
+        with numpyro.plate("place", 5):
+            numpyro.sample("level", dist.Normal(0.0, size))
+        cond(
+            load.sum() > 0,
+            lambda _: numpyro.deterministic("sign", 1.0),
+            lambda _: numpyro.deterministic("sign", -1.0),
+            None,
+        )
+        with numpyro.plate("room", ROOM, dim=-2), numpyro.plate("hour", HOURS, dim=-1):
+            numpyro.sample("y", dist.Normal(0.0 * load, size), obs=y)
+
+    data = of_rooms("walk")
+    drawn = decentred(branching, data, ["level"])
+    site = numpyro.handlers.trace(numpyro.handlers.seed(drawn, 0)).get_trace(**data)
+    assert "level_decentered" in site
+    assert site["sign"]["value"] == 1.0
 
 
 @pytest.mark.parametrize("kind", ["walk", "curve", "state"])
