@@ -70,7 +70,7 @@ def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
     found = [] if fitted.converged else ["the fit of the base model had not converged"]
     if problem.declaration.factors:
         names = ", ".join(problem.declaration.factors)
-        remedy = "give what is observed a distribution, if it is data"
+        remedy = "if it is data, observe a distribution, say LeftCensoredDistribution"
         found.append(
             f"what numpyro.factor adds ({names}) counts as a prior, and no gap is looked for in it; {remedy}"
         )

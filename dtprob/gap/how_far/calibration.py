@@ -21,7 +21,7 @@ from dtprob.gap.fitting.newton import positive
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.how_far.closed import Fold
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation.likelihoods import LIKELIHOODS
+from dtprob.gap.observation.likelihoods import likelihood
 
 _WIDEST: Final = 2.0
 """Log spread beyond which the noise's own spread is not followed."""
@@ -63,7 +63,7 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
         inside.append(np.abs(scaled) <= _reach(swing))
         squares.append(scaled**2 * np.exp(-2 * swing**2))
         families |= {o.family for o in problem.compiled.observations(part.x).values()}
-    known = [LIKELIHOODS[family] for family in families]
+    known = [likelihood(family) for family in families]
     each, squared = np.concatenate(inside), np.concatenate(squares)
     if not each.size:
         return Calibration(None, None)
@@ -131,7 +131,7 @@ def _swing(problem: Problem, unknown: np.ndarray, held: np.ndarray) -> np.ndarra
     rows[held] = (unknown**2).sum(-1)
     found = {}
     for name, own in problem.by_observation(rows).items():
-        scale, spread = LIKELIHOODS[problem.families[name]].log_scale, problem.located[name]
+        scale, spread = likelihood(problem.families[name]).log_scale, problem.located[name]
         swing = (
             np.zeros_like(own)
             if scale is None

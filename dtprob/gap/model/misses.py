@@ -11,7 +11,7 @@ import jax.numpy as jnp
 
 from dtprob.gap.model.running import Outcome, Runner
 from dtprob.gap.observation import whiten
-from dtprob.gap.observation.likelihoods import LIKELIHOODS
+from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.models.declaration import Data, metadata
 
 _DECIBELS: Final = 10.0 / math.log(10.0)
@@ -60,9 +60,12 @@ def _entries(
         return (_DECIBELS * (jnp.log(value) - parameters["loc"])) ** 2, one, one
     if observation.family == "VonMises":
         return jnp.angle(jnp.exp(1j * (value - parameters["loc"]))) ** 2, nothing, one
+    expected = likelihood(observation.family).mean
+    if expected is not None:
+        return (value - expected(parameters)) ** 2, nothing, one
     if "loc" in parameters:
         return jnp.abs(value - parameters["loc"]) ** 2, jnp.abs(value) ** 2, one
-    if LIKELIHOODS[observation.family].is_outcome:
+    if likelihood(observation.family).is_outcome:
         return None
     return (value - whiten.distribution(observation).mean) ** 2, nothing, one
 

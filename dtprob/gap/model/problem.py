@@ -26,6 +26,7 @@ from dtprob.gap.model.layout import Block, Layout, make_layout, normal_of, trans
 from dtprob.gap.model.own import Own
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
+from dtprob.gap.model.responses import responses
 from dtprob.gap.model.rows import Rows, make_rows
 from dtprob.gap.model.running import Arrays, Runner
 from dtprob.gap.model.shapes import latent_shapes, observed_shapes, perturbed_sites, shapes_of_fields
@@ -244,6 +245,11 @@ class Problem:
     def rows_per_observation(self) -> float:
         """Whitened rows per observed entry."""
         return len(self.rows.ids) / max(self.n_observation, 1)
+
+    @cached_property
+    def responses(self) -> frozenset[str]:
+        """Arguments of the model that tell what was observed."""
+        return responses(self._declared, self.arrays)
 
     @cached_property
     def observed_values(self) -> dict[str, jax.Array]:

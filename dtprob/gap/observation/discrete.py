@@ -93,6 +93,22 @@ def counts_shift(p: Parameters, t: Parameters) -> jax.Array:
     return jnp.stack([mean / counts_deviation(p), t["concentration"] * counts_spread(p)])
 
 
+def geometric_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a geometric distribution, of the failures before a success; they grow with the value."""
+    return ((value * p["probs"] - (1 - p["probs"])) / jnp.sqrt(1 - p["probs"]))[None]
+
+
+def geometric_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a geometric distribution."""
+    return (-t["probs"] / (p["probs"] * jnp.sqrt(1 - p["probs"])))[None]
+
+
+def geometric_relocate(p: Parameters, step: jax.Array) -> Parameters:
+    """Another expected number of failures."""
+    odds = (1 - p["probs"]) / p["probs"] * jnp.exp(step / jnp.sqrt(1 - p["probs"]))
+    return {**p, "probs": 1 / (1 + odds)}
+
+
 def bernoulli_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of a Bernoulli or binomial distribution of logits; finite where the probability rounds to zero or one.
 

@@ -124,6 +124,16 @@ def laplace_shift(p: Parameters, t: Parameters) -> jax.Array:
     return jnp.stack([t["loc"], t["scale"]]) / p["scale"]
 
 
+def half_normal_residual(p: Parameters, value: jax.Array) -> jax.Array:
+    """Rows of a half-normal distribution."""
+    return (((value / p["scale"]) ** 2 - 1.0) / _ROOT_TWO)[None]
+
+
+def half_normal_shift(p: Parameters, t: Parameters) -> jax.Array:
+    """Shift of the rows of a half-normal distribution."""
+    return (_ROOT_TWO * t["scale"] / p["scale"])[None]
+
+
 def exponential_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of an exponential distribution."""
     return (p["rate"] * value - 1.0)[None]

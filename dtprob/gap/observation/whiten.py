@@ -9,18 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpyro.distributions as dist
 
-from dtprob.errors import InputError
-from dtprob.gap.observation.likelihoods import LIKELIHOODS, SAME
+from dtprob.gap.observation.likelihoods import likelihood
+from dtprob.gap.observation.recognise import recognised, unwrapped
 from dtprob.gap.observation.residuals import Parameters
-
-_WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
-"""What changes the shape or the weight of a distribution and not its density."""
 
 
 @dataclass(frozen=True)
@@ -47,35 +43,10 @@ def observation(fn: Any, value: Any, name: str) -> Observation:
     Raises:
         InputError: the diagnosis has no whitening for the distribution.
     """
-    mask: Any = None
-    while isinstance(fn, _WRAPPERS):
-        if isinstance(fn, dist.MaskedDistribution):
-            own = jnp.asarray(fn._mask)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-            own = own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
-            mask = own if mask is None else mask & own
-        fn = fn.base_dist
-    kinds = (
-        type(fn).__mro__ if type(fn).__module__.startswith("numpyro.") else [type(fn)]
-    )  # one's own may differ
-    names = (SAME.get(kind.__name__, kind.__name__) for kind in kinds)
-    family = next((known for known in names if known in LIKELIHOODS), None)
-    if family is None:
-        raise InputError(
-            f"observed site {name!r}",
-            f"a distribution among {', '.join(LIKELIHOODS)}",
-            type(fn).__name__,
-            "Declare the observation with one of these to diagnose its gap.",
-        )
-    shape = jnp.shape(value)
-    parameters = {}
-    known = LIKELIHOODS[family]
-    for parameter in known.parameters:
-        array = jnp.asarray(getattr(fn, parameter))
-        array = array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(float)
-        trailing = array.shape[array.ndim - known.trailing.get(parameter, 0) :]
-        parameters[parameter] = jnp.broadcast_to(array, shape + trailing)
+    fn, mask = unwrapped(fn)
+    family, parameters = recognised(fn, value, name)
     if mask is not None:
-        parameters["mask"] = jnp.broadcast_to(jnp.asarray(mask, float), shape)
+        parameters["mask"] = jnp.broadcast_to(jnp.asarray(mask, float), jnp.shape(value))
     return Observation(family, parameters)
 
 
@@ -88,7 +59,7 @@ def rewritten(observed: Observation, fn: Any, value: Any, name: str) -> Observat
 
 def log_prob(observed: Observation, value: jax.Array) -> jax.Array:
     """Elementwise log density, zero where masked; shape of the value."""
-    elementwise = LIKELIHOODS[observed.family].log_prob
+    elementwise = likelihood(observed.family).log_prob
     if elementwise is not None:
         return observed.masked(elementwise(observed.parameters, value))
     return observed.masked(distribution(observed).log_prob(value))
@@ -102,32 +73,32 @@ def sample(observed: Observation, key: jax.Array) -> jax.Array:
 def distribution(observed: Observation) -> Any:
     """The NumPyro distribution, without its mask."""
     parameters = {n: v for n, v in observed.parameters.items() if n != "mask"}
-    return LIKELIHOODS[observed.family].make(**parameters)
+    return likelihood(observed.family).make(**parameters)
 
 
 def residual(observed: Observation, value: jax.Array) -> jax.Array:
     """Whitened residuals, shape (component, *shape of the value): zero mean and identity covariance under the model."""
-    return observed.masked(LIKELIHOODS[observed.family].residual(observed.parameters, value))
+    return observed.masked(likelihood(observed.family).residual(observed.parameters, value))
 
 
 def shift(observed: Observation, tangent: Mapping[str, jax.Array]) -> jax.Array:
     """Whitened shift of a change of the parameters, shape (component, *shape of the value)."""
-    return observed.masked(LIKELIHOODS[observed.family].shift(observed.parameters, dict(tangent)))
+    return observed.masked(likelihood(observed.family).shift(observed.parameters, dict(tangent)))
 
 
 def location_rows(family: str, n_rows: int) -> int:
     """How many of an observation's rows stand for its location or probability rather than its spread."""
-    located = LIKELIHOODS[family].located
+    located = likelihood(family).located
     return n_rows if located is None else located
 
 
 def is_joint(family: str) -> bool:
     """Whether entries along the last axis are one vector, of which no entry stands alone."""
-    return LIKELIHOODS[family].log_prob is not None
+    return likelihood(family).log_prob is not None
 
 
 def moved(observed: Observation, step: jax.Array, *, spread: bool) -> Observation | None:
     """The observation with its location, or its spread, moved by whitened steps; None where its family has no such move."""
-    known = LIKELIHOODS[observed.family]
+    known = likelihood(observed.family)
     move = known.respread if spread else known.relocate
     return None if move is None else Observation(observed.family, move(observed.parameters, step))

@@ -9,7 +9,7 @@ import numpy as np
 
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation.likelihoods import LIKELIHOODS
+from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.tails import family_wise, gamma_tail
 
 
@@ -42,7 +42,7 @@ def scan_coordinates(
     blocks: list[tuple[str, int, int]] = []
     p, excess, maps = [], [], {}
     located = problem.rows.by_cluster(problem.rows.located) == 1
-    seen_as_outcomes = any(LIKELIHOODS[family].is_outcome for family in problem.families.values())
+    seen_as_outcomes = any(likelihood(family).is_outcome for family in problem.families.values())
     for axis, position in problem.rows.coordinates.items():
         index = np.where(located, problem.rows.by_cluster(position), -1)
         size = int(index.max()) + 1

@@ -262,8 +262,7 @@ def whole_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
 
 
 def _given(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of the data, but for what is observed."""
-    arguments = {site.argument for site in problem.declaration.observed.values()}
+    """The arrays of the data, but for what tells what was observed."""
     for name, values in problem.data.items():
-        if name not in arguments and eqx.is_array_like(values):
+        if name not in problem.responses and eqx.is_array_like(values):
             yield name, np.asarray(values)

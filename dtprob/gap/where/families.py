@@ -16,7 +16,7 @@ import numpy as np
 from scipy import sparse
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation.likelihoods import LIKELIHOODS
+from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.where.curves import Curves, Quantity, cycles, stretches
 
 _BAND: Final = 6
@@ -148,7 +148,7 @@ def observed(problem: Problem, rows: np.ndarray) -> Iterator[Site]:
     for name, own in problem.by_observation(rows).items():
         site, count = problem.declaration.observed[name], own.shape[1]
         located = problem.located[name]
-        complex_parts = 2 if LIKELIHOODS[problem.families[name]].is_complex else 1
+        complex_parts = 2 if likelihood(problem.families[name]).is_complex else 1
         for kind, moved in (("location", range(complex_parts)), ("spread", range(located, located + 1))):
             wanted = located < count if kind == "spread" else not problem.float_sites
             if wanted:

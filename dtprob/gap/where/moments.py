@@ -18,7 +18,7 @@ import numpy as np
 from scipy.special import ndtr
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation.likelihoods import LIKELIHOODS, Likelihood
+from dtprob.gap.observation.likelihoods import Likelihood, likelihood
 from dtprob.gap.observation.residuals import Parameters
 from dtprob.gap.where.bounded import beside, complex_tails, scored, skewness, tails
 from dtprob.gap.where.families import Family, Pattern
@@ -49,7 +49,7 @@ def further_moments(
         x: the fit.
         rows: projected ones (n, cluster, row), of the data first.
     """
-    families = {name: LIKELIHOODS[family] for name, family in problem.families.items()}
+    families = {name: likelihood(family) for name, family in problem.families.items()}
     every, observations = problem.by_observation(rows), problem.compiled.observations(x)
     looked = {
         name: own[:, :1] + 1j * own[:, 1:2] if families[name].is_complex else own[:, : problem.located[name]]

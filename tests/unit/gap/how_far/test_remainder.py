@@ -16,7 +16,8 @@ from dtprob.effects.effect import FIELD
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.calibration import calibration
-from dtprob.gap.how_far.remainder import alone, field_of, model_remainder, shortlist
+from dtprob.gap.how_far.remainder import alone, model_remainder, shortlist
+from dtprob.gap.how_far.site_field import field_of
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.curves import curves, quantity
 from dtprob.gap.where.families import Family, Pattern, deterministic, families

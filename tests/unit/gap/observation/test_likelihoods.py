@@ -1,4 +1,4 @@
-"""Observations of many kinds are diagnosed: counts of packets, fading powers, phases, shadowing that neighbours share."""
+"""Observations of many kinds are diagnosed: counts of packets, fading powers, phases, shadowing, floors, mixtures."""
 
 import jax
 import jax.numpy as jnp
@@ -14,7 +14,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
 
-STREETS, PLACES, PACKETS = 30, 10, 40
+STREETS, PLACES, PACKETS, FLOOR = 30, 10, 40, -1.0
 SETTINGS = Settings(replicates=200, site_replicates=39, candidates=3, max_effects=2)
 APART = np.abs(np.subtract.outer(np.arange(PLACES), np.arange(PLACES)))
 ROOT = jnp.asarray(np.linalg.cholesky(np.exp(-APART / 3.0)))
@@ -47,7 +47,29 @@ def turned(level):
     return dist.VonMises(0.4 * level, 2.0).to_event(1)
 
 
+def floored(level, y):
+    """dB, those below -1 dB known only to be there."""
+    deviation = numpyro.sample("deviation", dist.LogNormal(0.0, 1.0))
+    return dist.LeftCensoredDistribution(dist.Normal(level, deviation), y <= FLOOR).to_event(1)
+
+
+def hidden(level):
+    """dB, a third of the places 8 dB lower and noisier, nobody knows which."""
+    share = numpyro.sample("share", dist.Beta(1.0, 1.0))
+    loss = numpyro.sample("loss", dist.HalfNormal(10.0))
+    parts = dist.Normal(jnp.stack([level, level - loss], -1), jnp.array([1.0, 3.0]))
+    weights = jnp.broadcast_to(jnp.stack([1 - share, share]), parts.batch_shape)
+    return dist.MixtureSameFamily(dist.Categorical(probs=weights), parts).to_event(1)
+
+
+def idle(level):
+    """Packets, none in a fifth of the intervals whatever the level."""
+    idle = numpyro.sample("idle", dist.Beta(1.0, 1.0))
+    return dist.ZeroInflatedPoisson(idle, jnp.exp(0.3 * level + 1.0)).to_event(1)
+
+
 OBSERVED = {"received": received, "faded": faded, "shadowed": shadowed, "bursty": bursty, "turned": turned}
+OBSERVED |= {"floored": floored, "hidden": hidden, "idle": idle}
 
 
 def streets(kind):
@@ -55,7 +77,7 @@ def streets(kind):
         slope = numpyro.sample("slope", dist.Normal(1.0, 1.0))
         offset = numpyro.sample("offset", dist.Normal(0.0, 5.0))
         level = numpyro.deterministic("level", offset - slope * distance)
-        observed = OBSERVED[kind](level)
+        observed = floored(level, y) if kind == "floored" else OBSERVED[kind](level)
         with numpyro.plate("street", distance.shape[0]):
             numpyro.sample("y", observed, obs=y)
 
@@ -97,6 +119,13 @@ def table(kind, loss, seed):
             y = rng.poisson(rng.gamma(5.0, np.exp(0.23 * level + 3.0) / 5.0))
         case "turned":
             y = rng.vonmises(0.4 * level, 2.0)
+        case "floored":
+            y = np.maximum(level + 1.5 * rng.standard_normal(level.shape), FLOOR)
+        case "hidden":
+            low = rng.uniform(size=level.shape) < 1 / 3
+            y = level - 8.0 * low + np.where(low, 3.0, 1.0) * rng.standard_normal(level.shape)
+        case "idle":
+            y = rng.poisson(np.exp(0.3 * level + 1.0)) * (rng.uniform(size=level.shape) > 0.2)
         case _:
             y = level + 1.5 * rng.standard_normal((STREETS, PLACES)) @ np.asarray(ROOT).T
     return {"distance": jnp.asarray(distance), "blocked": jnp.asarray(blocked), "y": jnp.asarray(y)}
@@ -137,3 +166,20 @@ def test_a_vector_is_not_torn_into_clusters():
     data = {"distance": jnp.linspace(0.0, 1.0, PLACES), "y": jnp.zeros(PLACES)}
     with pytest.raises(InputError, match="whole vectors of 'y' in each"):
         Problem(model, data, EFFECTS[1:])
+
+
+def test_what_tells_the_outcome_explains_nothing():
+    """The censored ones are those of low readings: a right twin seemed to err by that column."""
+
+    def model(distance, censored, power, y=None):
+        level = numpyro.deterministic("level", numpyro.sample("offset", dist.Normal(0.0, 5.0)) - distance)
+        with numpyro.plate("place", len(distance)):
+            numpyro.sample("y", dist.LeftCensoredDistribution(dist.Normal(level, 1.0), censored), obs=y)
+            numpyro.sample("log_power", dist.Normal(level, 1.0), obs=jnp.log(power))
+
+    rng = np.random.default_rng(0)
+    distance = np.linspace(0.0, 3.0, 40)
+    y = np.maximum(-distance + rng.standard_normal(40), -2.0)
+    data = {"distance": distance, "censored": y <= -2.0, "y": y, "power": np.exp(rng.standard_normal(40))}
+    data = {name: jnp.asarray(value) for name, value in data.items()}
+    assert Problem(model, data, ()).responses == {"censored", "y", "power"}

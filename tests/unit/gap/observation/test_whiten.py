@@ -10,7 +10,7 @@ from scipy import stats
 from dtprob.effects.distributions import ComplexStudentT
 from dtprob.errors import InputError
 from dtprob.gap.observation import discrete, whiten
-from dtprob.gap.observation.likelihoods import LIKELIHOODS
+from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, likelihood
 from dtprob.models.complex_normal import ComplexNormal
 
 
@@ -21,6 +21,10 @@ def strong(value):
 
 LOGITS = jnp.array([0.3, -1.2, 0.8])
 PROBABILITY = jax.nn.softmax(LOGITS)
+
+WEIGHTS = strong([0.3, 0.7])
+LOCATED = {"loc": strong(-0.3), "scale": strong(0.6)}
+LOCATED_CHANGE = {"loc": strong(0.7), "scale": strong(0.4)}
 
 # (family, make distribution, parameters, tangent)
 FAMILIES = {
@@ -119,8 +123,63 @@ FAMILIES = {
         {"probs": PROBABILITY},
         {"probs": jnp.array([0.3, -0.1, -0.2])},
     ),
+    "Logistic": (dist.Logistic, LOCATED, LOCATED_CHANGE),
+    "Gumbel": (dist.Gumbel, LOCATED, LOCATED_CHANGE),
+    "Cauchy": (dist.Cauchy, LOCATED, LOCATED_CHANGE),
+    "HalfNormal": (dist.HalfNormal, {"scale": strong(0.6)}, {"scale": strong(0.4)}),
+    "InverseGamma": (
+        dist.InverseGamma,
+        {"concentration": strong(1.8), "rate": strong(0.7)},
+        {"concentration": strong(0.5), "rate": strong(-0.4)},
+    ),
+    "GeometricProbs": (dist.Geometric, {"probs": strong(0.3)}, {"probs": strong(0.2)}),
+    "BetaBinomial": (
+        lambda total_count, **p: dist.BetaBinomial(total_count=jnp.asarray(total_count, int), **p),
+        {"concentration1": strong(3.2), "concentration0": strong(0.8), "total_count": strong(40.0)},
+        {"concentration1": strong(0.5), "concentration0": strong(-0.3), "total_count": strong(0.0)},
+    ),
+    "ZeroInflated Poisson": (
+        lambda gate, **p: dist.ZeroInflatedDistribution(dist.Poisson(**p), gate=gate),
+        {"rate": strong(2.3), "gate": strong(0.2)},
+        {"rate": strong(0.6), "gate": strong(0.3)},
+    ),
+    "ZeroInflated GammaPoisson": (
+        lambda gate, **p: dist.ZeroInflatedDistribution(dist.GammaPoisson(**p), gate=gate),
+        {"concentration": strong(2.6), "rate": strong(0.4), "gate": strong(0.2)},
+        {"concentration": strong(0.4), "rate": strong(-0.1), "gate": strong(0.3)},
+    ),
+    **{
+        f"Mixture {base.__name__}": (
+            lambda log_weight, base=base, **p: dist.MixtureSameFamily(
+                dist.Categorical(logits=log_weight), base(**p)
+            ),
+            {"loc": strong([-0.3, 2.0]), "scale": strong([0.6, 0.9]), "log_weight": jnp.log(WEIGHTS)},
+            {"loc": strong([0.7, -0.4]), "scale": strong([0.4, 0.2]), "log_weight": strong([0.3, -0.2])},
+        )
+        for base in (dist.Normal, dist.LogNormal)
+    },
+    **{
+        f"{side}Truncated {base.__name__}": (
+            lambda made=made, base=base, bounds=tuple(bounds), **p: made(
+                base(**{n: v for n, v in p.items() if n not in bounds}), **{n: p[n] for n in bounds}
+            ),
+            {**LOCATED, **bounds},
+            {**LOCATED_CHANGE, **dict.fromkeys(bounds, strong(0.0))},
+        )
+        for side, made, bounds in (
+            ("Left", dist.LeftTruncatedDistribution, {"low": strong(-0.5)}),
+            ("Right", dist.RightTruncatedDistribution, {"high": strong(0.4)}),
+            ("TwoSided", dist.TwoSidedTruncatedDistribution, {"low": strong(-0.8), "high": strong(1.1)}),
+        )
+        for base in (dist.Normal, dist.Logistic)
+    },
 }
 COUNT = 100_000
+
+
+def test_every_family_is_tested():
+    tested = {family.split(" ")[0] for family in FAMILIES} | set(CENSORED)
+    assert tested == {*LIKELIHOODS, *COMPOUNDS}
 
 
 def draws(family, n=COUNT):
@@ -266,15 +325,89 @@ def test_samples_follow_the_observation():
 
 def test_unknown_distribution_is_refused_by_name():
     others = [
-        dist.BetaBinomial(2.0, 1.0, 3),
-        dist.InverseGamma(2.0, 1.0),  # made of a gamma, an exponential, a normal
-        dist.Pareto(1.0, 2.0),
-        dist.LeftTruncatedDistribution(dist.Normal(), low=0.0),
+        dist.Pareto(1.0, 2.0),  # made of an exponential, a normal
         dist.TransformedDistribution(dist.Normal(), dist.transforms.ExpTransform()),
     ]
     for other in others:
         with pytest.raises(InputError, match=rf"observed site 'y'.*{type(other).__name__}"):
             whiten.observation(other, jnp.full((), 0.5), "y")
+
+
+CENSORED = {
+    "LeftCensored": (dist.LeftCensoredDistribution, np.maximum),
+    "RightCensored": (dist.RightCensoredDistribution, np.minimum),
+}
+CENSORED_BASES = {
+    "Normal": (dist.Normal, LOCATED, LOCATED_CHANGE, -0.1),
+    "LogNormal": (dist.LogNormal, LOCATED, LOCATED_CHANGE, 0.9),
+    "Logistic": (dist.Logistic, LOCATED, LOCATED_CHANGE, -0.1),
+    "Exponential": (dist.Exponential, {"rate": strong(2.3)}, {"rate": strong(0.6)}, 0.4),
+    "Weibull": (*FAMILIES["Weibull"], 1.5),
+}
+
+
+def censored(side, base, n):
+    """So many readings, those beyond a limit at it, and what is observed."""
+    make, clip = CENSORED[side]
+    kind, parameters, _, limit = CENSORED_BASES[base]
+    values = strong(clip(np.asarray(kind(**parameters).sample(jax.random.key(4), (n,))), limit))
+    fn = make(kind(**each(parameters, values)), values == limit)
+    return values, fn, whiten.observation(fn, values, "y")
+
+
+@pytest.mark.parametrize("base", CENSORED_BASES)
+@pytest.mark.parametrize("side", CENSORED)
+def test_readings_beyond_a_limit(side, base):
+    make, _ = CENSORED[side]
+    kind, parameters, change, limit = CENSORED_BASES[base]
+    values, fn, observed = censored(side, base, COUNT)
+    assert observed.family == f"{side} {base}"
+    rows = np.asarray(whiten.residual(observed, values))
+    fourth = (rows[:, None] ** 2 * rows[None] ** 2).mean(-1)
+    assert np.all(np.abs(rows.mean(1)) < 5 / np.sqrt(COUNT))
+    assert np.all(np.abs(np.cov(rows) - np.eye(len(rows))) < 5 * np.sqrt(fourth / COUNT) + 1e-9)
+
+    def density(t):
+        moved = {k: v + t * change[k] for k, v in parameters.items()}
+        return make(kind(**each(moved, values[:50])), values[:50] == limit).log_prob(values[:50])
+
+    first = whiten.Observation(observed.family, {n: p[:50] for n, p in observed.parameters.items()})
+    still = {"limit": jnp.zeros(50), "censored": jnp.zeros(50)}
+    moved = whiten.shift(first, {**each(change, values[:50]), **still})
+    score = (whiten.residual(first, values[:50]) * moved).sum(0)
+    np.testing.assert_allclose(score, (density(1e-6) - density(-1e-6)) / 2e-6, rtol=2e-5, atol=2e-5)
+    np.testing.assert_allclose(whiten.log_prob(observed, values), fn.log_prob(values), rtol=1e-6)
+    again = whiten.sample(observed, jax.random.key(8))
+    share = np.mean(values == limit)
+    assert abs(np.mean(again == limit) - share) < 5 * np.sqrt(2 * share * (1 - share) / COUNT)
+
+
+def test_a_reading_far_beyond_its_limit_stays_finite():
+    for loc in (40.0, -40.0):
+        fn = dist.LeftCensoredDistribution(dist.Normal(jnp.full(2, loc), 1.0), jnp.array([True, False]))
+        observed = whiten.observation(fn, jnp.array([0.0, 1.0]), "y")
+        still = {n: jnp.zeros(2) for n in observed.parameters}
+        assert np.all(np.isfinite(whiten.residual(observed, jnp.array([0.0, 1.0]))))
+        assert np.all(np.isfinite(whiten.shift(observed, {**still, "loc": jnp.ones(2)})))
+
+
+def test_limits_of_readings_that_were_not_censored():
+    """The farthest limit of any; a reading beyond that had none."""
+    values = jnp.array([-90.0, -100.0, -95.0, -101.0, -80.0])
+    fn = dist.LeftCensoredDistribution(dist.Normal(jnp.zeros(5), 1.0), jnp.array([1, 1, 0, 0, 0]) == 1)
+    limit = whiten.observation(fn, values, "y").parameters["limit"]
+    np.testing.assert_array_equal(limit, [-90.0, -100.0, -100.0, -np.inf, -100.0])
+
+
+def test_parts_of_a_mixture_that_share_a_scale():
+    fn = dist.MixtureSameFamily(
+        dist.Categorical(probs=jnp.array([0.3, 0.7])), dist.Normal(jnp.zeros((4, 2)), 1.0)
+    )
+    observed = whiten.observation(fn, jnp.arange(4.0), "y")
+    assert {p.shape for p in observed.parameters.values()} == {(4, 2)}
+    np.testing.assert_allclose(
+        whiten.log_prob(observed, jnp.arange(4.0)), fn.log_prob(jnp.arange(4.0)), rtol=1e-6
+    )
 
 
 def test_information_on_the_spread_of_counts():
@@ -344,18 +477,19 @@ def test_a_mask_of_whole_vectors():
 
 MOVES = [
     (family, spread)
-    for family, known in LIKELIHOODS.items()
+    for family in FAMILIES
     for spread in (False, True)
-    if (known.respread if spread else known.relocate) is not None
+    if (likelihood(family).respread if spread else likelihood(family).relocate) is not None
 ]
 
 
 @pytest.mark.parametrize(("family", "spread"), MOVES)
 def test_a_move_shifts_one_row_by_its_step(family, spread):
-    observed = batch(family, draws(family, 1))
+    values = draws(family, 1)
+    observed = batch(family, values)
     if family == "ComplexStudentT":
         observed.parameters["tail"] = jnp.full(1, 0.3)
-    like = jnp.zeros(observed.parameters[LIKELIHOODS[family].parameters[0]].shape, float)
+    like = jnp.zeros_like(values, float)
     step = 0.3 + 0.2 * jnp.arange(like.size).reshape(like.shape)
 
     def parameters(t):

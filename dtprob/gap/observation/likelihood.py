@@ -1,0 +1,52 @@
+"""What a diagnosis has to know of a family of distributions of observations."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+
+from dtprob.gap.observation.residuals import Parameters
+
+type Rows = Callable[[Parameters, Any], jax.Array]
+type Move = Callable[[Parameters, jax.Array], Parameters]
+
+
+@dataclass(frozen=True)
+class Likelihood:
+    """One family of distributions.
+
+    Attributes:
+        make: the NumPyro distribution from its parameters.
+        parameters: names of the parameters, each an attribute of the distribution.
+        residual: (parameters, values) -> rows (component, *shape of the value).
+        shift: (parameters, a change of each) -> what it adds to the rows.
+        located: how many of the rows, the first ones, stand for a location or probability; None for all.
+        relocate: (parameters, step) -> parameters whose first row is shifted by the step; None where that is not possible.
+        respread: the same for the first row that is no location.
+        log_scale: of families whose first rows are normal, the logarithm of the scale for a unit step of that row.
+        probability: (parameters, first row) -> probability of a smaller value, of families that are neither normal nor
+            discrete and whose first row grows with the value.
+        is_outcome: whether one of a few outcomes is seen.
+        is_complex: whether the first two rows are the real and the imaginary part of one.
+        trailing: axes that a parameter has beyond those of the value.
+        mean: expected value, where it is neither the location nor the distribution's own.
+        log_prob: log density of each entry given those before it, where the entries of the last axis are one vector.
+    """
+
+    make: Callable[..., Any]
+    parameters: tuple[str, ...]
+    residual: Rows
+    shift: Rows
+    located: int | None = None
+    relocate: Move | None = None
+    respread: Move | None = None
+    log_scale: float | None = None
+    probability: Rows | None = None
+    is_outcome: bool = False
+    is_complex: bool = False
+    trailing: Mapping[str, int] = field(default_factory=dict)
+    mean: Callable[[Parameters], jax.Array] | None = None
+    log_prob: Rows | None = None

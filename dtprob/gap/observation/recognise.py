@@ -1,0 +1,134 @@
+"""Which family of observations a NumPyro distribution is of, and its parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any, Final, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpyro.distributions as dist
+
+from dtprob.errors import InputError
+from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, SAME, likelihood
+from dtprob.gap.observation.normal_scores import NORMAL_SCORES
+
+_WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
+"""What changes the shape or the weight of a distribution and not its density."""
+
+
+class _Found(NamedTuple):
+    """A family, and its parameters without common shape."""
+
+    family: str
+    parameters: Mapping[str, Any]
+
+
+def unwrapped(fn: Any) -> tuple[Any, Any]:
+    """A distribution without what changes its shape or its mask, and the mask; None where all counts."""
+    mask: Any = None
+    while isinstance(fn, _WRAPPERS):
+        if isinstance(fn, dist.MaskedDistribution):
+            own = jnp.asarray(fn._mask)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+            own = own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
+            mask = own if mask is None else mask & own
+        fn = fn.base_dist
+    return fn, mask
+
+
+def recognised(fn: Any, value: Any, name: str) -> tuple[str, dict[str, jax.Array]]:
+    """Family and parameters of an unwrapped distribution, each broadcast to the value's shape and its further axes.
+
+    Args:
+        fn: the distribution.
+        value: the data.
+        name: of the site.
+
+    Raises:
+        InputError: the diagnosis does not know the distribution.
+    """
+    found = _compound(fn, value) or _plain(fn)
+    if found is None:
+        raise InputError(
+            f"observed site {name!r}",
+            f"a distribution among {', '.join(LIKELIHOODS)}, or one of them that is "
+            f"{', '.join(COMPOUNDS)} (the last six: of {', '.join(NORMAL_SCORES)})",
+            _described(fn),
+            "Declare the observation with one of these to diagnose its gap.",
+        )
+    parameters = {}
+    for parameter, given in found.parameters.items():
+        array = jnp.asarray(given)
+        array = array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(float)
+        trailing = array.shape[array.ndim - likelihood(found.family).trailing.get(parameter, 0) :]
+        parameters[parameter] = jnp.broadcast_to(array, jnp.shape(value) + trailing)
+    return found.family, parameters
+
+
+def _described(fn: Any) -> str:
+    """The class of a distribution, and of what it is made of."""
+    parts = [type(part).__name__ for part in _parts(fn)]
+    return f"{type(fn).__name__} of {', '.join(parts)}" if parts else type(fn).__name__
+
+
+def _parts(fn: Any) -> Iterator[Any]:
+    for name in ("base_dist", "component_distribution"):
+        if isinstance(getattr(fn, name, None), dist.Distribution):
+            yield unwrapped(getattr(fn, name))[0]
+
+
+def _plain(fn: Any) -> _Found | None:
+    """One of the distributions that stand alone; a class of one's own may differ from what it is derived from."""
+    kinds = type(fn).__mro__ if type(fn).__module__.startswith("numpyro.") else [type(fn)]
+    names = (SAME.get(kind.__name__, kind.__name__) for kind in kinds)
+    family = next((known for known in names if known in LIKELIHOODS), None)
+    if family is None:
+        return None
+    return _Found(family, {n: getattr(fn, n) for n in LIKELIHOODS[family].parameters})
+
+
+def _compound(fn: Any, value: Any) -> _Found | None:
+    """One that is made of another."""
+    if isinstance(fn, dist.MixtureSameFamily):
+        return _mixed(fn)
+    if isinstance(fn, dist.ZeroInflatedProbs):
+        found = _plain(unwrapped(fn.base_dist)[0])
+        if found is None or LIKELIHOODS[found.family].is_outcome:
+            return None
+        return _Found(f"ZeroInflated {found.family}", {**found.parameters, "gate": fn.gate})
+    if isinstance(fn, (dist.LeftCensoredDistribution, dist.RightCensoredDistribution)):
+        kind = "LeftCensored" if isinstance(fn, dist.LeftCensoredDistribution) else "RightCensored"
+        censored = jnp.broadcast_to(fn.censored, jnp.shape(value))
+        return _of(kind, fn.base_dist, {"limit": _limits(kind, censored, value), "censored": censored})
+    for kind, bounds in (("Left", ("low",)), ("Right", ("high",)), ("TwoSided", ("low", "high"))):
+        if type(fn) is getattr(dist, f"{kind}TruncatedDistribution"):
+            return _of(f"{kind}Truncated", fn.base_dist, {n: getattr(fn, n) for n in bounds})
+    return None
+
+
+def _mixed(fn: Any) -> _Found | None:
+    chance = fn.mixing_distribution.probs
+    found = _of("Mixture", fn.component_distribution, {"log_weight": jnp.log(chance)})
+    if found is None:
+        return None
+    shapes = {n: jnp.broadcast_shapes(jnp.shape(v), chance.shape[-1:]) for n, v in found.parameters.items()}
+    return _Found(found.family, {n: jnp.broadcast_to(v, shapes[n]) for n, v in found.parameters.items()})
+
+
+def _of(kind: str, base: Any, further: Mapping[str, Any]) -> _Found | None:
+    found = _plain(unwrapped(base)[0])
+    if found is None or found.family not in NORMAL_SCORES:
+        return None
+    return _Found(f"{kind} {found.family}", {**found.parameters, **further})
+
+
+def _limits(kind: str, censored: jax.Array, value: Any) -> jax.Array:
+    """Where each reading would have been censored.
+
+    Those that were are at their limit; the others are taken to have had the farthest limit of any, if they are within it.
+    """
+    sign = 1.0 if kind == "LeftCensored" else -1.0
+    own = sign * jnp.asarray(value, float)
+    censored = censored & jnp.isfinite(own)
+    farthest = jnp.where(censored, own, jnp.inf).min()
+    return sign * jnp.where(censored, own, jnp.where(own > farthest, farthest, -jnp.inf))
