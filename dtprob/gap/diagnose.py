@@ -16,6 +16,7 @@ from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.integrated import based
 from dtprob.gap.fitting.soundness import idle, notes
+from dtprob.gap.fitting.states import held
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
 from dtprob.gap.how_far.shares import shares
@@ -31,7 +32,7 @@ from dtprob.gap.which.search import search
 from dtprob.gap.which.trials import Say, credit
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
-from dtprob.models.declaration import Data, Model
+from dtprob.models.arguments import Data, Model
 
 _DEFAULT = Settings()
 
@@ -81,13 +82,13 @@ def diagnose(
             f"{problem.n_cluster} along {problem.cluster_name!r}",
             "Give more links, episodes or segments, or another cluster axis.",
         )
-    shared = sum(block.size for block in problem.blocks_of(None) if not block.local)
+    shared = len(held(problem))
     if shared >= problem.n_observation:
         raise InputError(
             f"latent sites without entries of their own for each of {problem.cluster_name!r}",
             f"fewer unknowns than the {problem.n_observation} observed values",
             str(shared),
-            "Integrate states out, with a Kalman filter say, or choose a cluster that has states of its own.",
+            "Leave some out, or choose a cluster that has entries of its own.",
         )
     check_nulls(problem)
     evidence = _gather(problem, key, settings, say)

@@ -22,7 +22,7 @@ from dtprob.inference.relaxation import find_layout
 from dtprob.inference.svi import SVI
 from dtprob.inference.target import Inputs, Target
 from dtprob.inference.von_mises_em import VonMisesEM
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 MOST_COORDINATES = 500
 """Coordinates up to which the No-U-Turn sampler is chosen."""

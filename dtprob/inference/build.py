@@ -16,15 +16,8 @@ from numpyro.distributions import biject_to, constraints
 from dtprob.errors import InputError
 from dtprob.inference.circular import mean_direction
 from dtprob.inference.target import Coordinates, Inputs, Target, free_value
-from dtprob.models.declaration import (
-    Data,
-    Model,
-    base_constraint,
-    declare,
-    model_name,
-    split_static,
-    trace_model,
-)
+from dtprob.models.arguments import Data, Model, model_name, split_static
+from dtprob.models.declaration import base_constraint, declare, trace_model
 
 _NORMAL_IQR = 1.349
 _KEPT_TARGETS = 32

@@ -33,7 +33,7 @@ from dtprob.inference.modes import search, starting_points
 from dtprob.inference.posterior import Posterior, Values
 from dtprob.inference.run import Loop
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 
 def fit_each(

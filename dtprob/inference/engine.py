@@ -12,7 +12,7 @@ import jax
 
 from dtprob.errors import InputError
 from dtprob.inference.posterior import Posterior
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 type Answer = Literal["exact", "approximation", "point"]
 type Serves = Literal["continuous", "circular", "tables"]

@@ -38,7 +38,7 @@ from dtprob.inference.resample import (
     with_noise,
 )
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Data, Model
+from dtprob.models.arguments import Data, Model
 
 _BLOCK = 32  # members optimised side by side
 

@@ -35,7 +35,8 @@ from dtprob.inference.gaussian import gaussian_posterior
 from dtprob.inference.laplace import gaussian_facts
 from dtprob.inference.posterior import Posterior, Values
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model, trace_model
+from dtprob.models.arguments import Model
+from dtprob.models.declaration import trace_model
 from dtprob.models.dirichlet import LogRatios, log_draws
 
 type Tables = dict[str, Float[Array, "*row outcome"]]

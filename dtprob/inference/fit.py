@@ -22,7 +22,7 @@ from dtprob.inference.posterior import Posterior
 from dtprob.inference.smc import SMC
 from dtprob.inference.svi import SVI
 from dtprob.inference.von_mises_em import VonMisesEM
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 ENGINES: Mapping[str, type[AbstractEngine]] = {
     engine.name: engine

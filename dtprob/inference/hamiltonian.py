@@ -15,7 +15,7 @@ from dtprob.inference.enough import Enough
 from dtprob.inference.kernel import Kernel
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.run import Schedule, run_chains
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from dtprob.inference.modes import find_mode, objective_value
 from dtprob.inference.optimise import curvature, gradient_and_hessian
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 COUNTS = {"draws": 1, "starts": 1, "max_steps": 1}
 """The least that the settings can be."""

@@ -13,7 +13,7 @@ from dtprob.inference.build import build_target
 from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
 from dtprob.inference.modes import find_mode
 from dtprob.inference.posterior import Posterior
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ from numpyro.primitives import Messenger
 from dtprob.errors import InputError
 from dtprob.inference.phasors import is_gaussian
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Declaration, Model, metadata, model, model_name
+from dtprob.models.arguments import Model, model_name
+from dtprob.models.declaration import Declaration, metadata, model
 
 type Scheme = Literal["noise", "weights", "clusters", "none"]
 

@@ -34,7 +34,7 @@ from dtprob.inference.modes import starting_points
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.progress import Progress
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 _EXPLORE_SHARE = 5
 _ROWS, _ENTRIES = (

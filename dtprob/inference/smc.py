@@ -31,7 +31,7 @@ from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions,
 from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 _ACCEPTANCE = 0.8
 _FIRST_STEP = 0.5

@@ -17,7 +17,7 @@ import xarray as xr
 from dtprob.errors import InputError
 from dtprob.files import atomic_write
 from dtprob.inference.posterior import Posterior
-from dtprob.models.declaration import unnamed_axes
+from dtprob.models.axes import unnamed_axes
 
 FORMAT = "dtprob posterior 1"
 _ENGINE = "h5netcdf"

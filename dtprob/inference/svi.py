@@ -40,7 +40,7 @@ from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.modes import find_mode
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 _WINDOW = 100  # updates between two looks at the bound
 _PATIENCE = 3  # windows without a rise after which the rate falls

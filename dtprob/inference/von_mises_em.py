@@ -44,7 +44,7 @@ from dtprob.inference.relaxation import (
     quadratic,
 )
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 _SWEEPS = 1000
 

@@ -7,9 +7,8 @@ samples, computes and observes. The decorator `model` only adds names for axes t
 from __future__ import annotations
 
 import functools
-import inspect
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, cast
 
 import equinox as eqx
@@ -20,19 +19,17 @@ import numpyro
 from numpyro import handlers
 from numpyro.distributions import constraints, distribution
 
-from dtprob.errors import InputError, nearest
+from dtprob.errors import InputError
+from dtprob.models.arguments import Data, Model, model_name, select_arguments, split_static
+from dtprob.models.axes import axes_of, lent
 
 # ArviZ registers NumPyro to be loaded later. Where it was imported first, Python runs numpyro.distributions twice, and the
 # second copy lacks the submodule in which numpyro.factor looks.
 numpyro.distributions.__dict__["distribution"] = distribution
 
-type Model = Callable[..., Any]
-type Data = Mapping[str, Any]
 type Kind = Literal["latent", "deterministic", "observed"]
 
 _METADATA = "__dtprob__"
-_UNNAMED = "_dim_"
-_ARRAYS = (jax.Array, np.ndarray, np.generic)
 
 
 @dataclass(frozen=True)
@@ -167,51 +164,6 @@ def metadata(function: Model) -> Metadata:
     return getattr(function, _METADATA, Metadata({}, None))
 
 
-def model_name(function: Model) -> str:
-    """The model's name in reports and files."""
-    while isinstance(function, functools.partial):
-        function = function.func
-    return getattr(function, "__name__", type(function).__name__)
-
-
-def select_arguments(function: Model, data: Data) -> dict[str, Any]:
-    """The entries of `data` that the model takes, checked against its signature.
-
-    Raises:
-        InputError: a required argument is missing, or the data has an entry that the model does not take.
-    """
-    parameters = inspect.signature(function).parameters
-    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
-    for name in data:
-        if name not in parameters and not takes_any:
-            hint = nearest(name, parameters)
-            raise InputError(
-                f"data for {model_name(function)}",
-                f"arguments among {', '.join(parameters)}",
-                repr(name),
-                f"Did you mean {hint!r}?" if hint else "Remove it, or add the argument to the model.",
-            )
-    for name, parameter in parameters.items():
-        is_variadic = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
-        if parameter.default is parameter.empty and not is_variadic and name not in data:
-            raise InputError(
-                f"data for {model_name(function)}",
-                f"an entry {name!r}",
-                ", ".join(data) or "nothing",
-                f"Give {name!r}, or a default in the model.",
-            )
-    return dict(data)
-
-
-def split_static(data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Data as (arrays, everything else), so that arrays can be arguments of compiled functions.
-
-    Plain numbers are settings: a model may size a plate by them.
-    """
-    arrays, static = eqx.partition(dict(data), lambda entry: isinstance(entry, _ARRAYS))
-    return cast("dict[str, Any]", arrays), cast("dict[str, Any]", static)
-
-
 def trace_model(
     function: Model, data: Data, key: jax.Array, substitute: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
@@ -258,6 +210,7 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
         raise InputError(
             f"model {model_name(function)}", "distributions that can be drawn from", "one that cannot", remedy
         ) from error
+    found = _with_lent_axes(found)
     declaration = Declaration(
         model_name(function), found, cluster or notes.cluster or _first_plate(found), tuple(factors)
     )
@@ -274,6 +227,17 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
             remedy = "Name the observed site of whose entries it tells"
             raise InputError(f"measure {name}", f"an observed site among {known}", repr(measure.site), remedy)
     return declaration
+
+
+def _with_lent_axes(sites: Mapping[str, Site]) -> dict[str, Site]:
+    """Sites, intermediates that are computed outside of plates with the axes of what is observed."""
+    observed = [(s.shape, s.axes) for s in sites.values() if s.kind == "observed"]
+    return {
+        name: replace(site, axes=lent(site.shape, site.axes, observed))
+        if site.kind == "deterministic"
+        else site
+        for name, site in sites.items()
+    }
 
 
 def is_factor(message: Mapping[str, Any]) -> bool:
@@ -303,11 +267,13 @@ def _site(message: Mapping[str, Any], notes: Metadata, data: Data) -> Site | Non
     fn = message["fn"] if kind != "deterministic" else None
     event_dim = fn.event_dim if fn is not None else 0
     shape = tuple(np.shape(value))
+    if kind == "observed":
+        _check_shape(name, shape, fn)
     return Site(
         name=name,
         kind=kind,
         shape=shape,
-        axes=_axes(name, shape, frames, event_dim, notes),
+        axes=axes_of(name, shape, frames, event_dim, notes.axes.get(name)),
         plates=tuple(frame.name for frame in frames),
         is_complex=bool(np.issubdtype(jax.numpy.result_type(value), np.complexfloating)),
         support=fn.support if fn is not None else None,
@@ -316,42 +282,31 @@ def _site(message: Mapping[str, Any], notes: Metadata, data: Data) -> Site | Non
     )
 
 
+def _check_shape(name: str, shape: tuple[int, ...], fn: Any) -> None:
+    """Observed values have to have the shape of their distribution, or to be more of it.
+
+    Raises:
+        InputError: NumPyro would pair each value with every distribution, or with none.
+    """
+    wanted = tuple(fn.shape())
+    try:
+        whole = np.broadcast_shapes(wanted, shape)
+    except ValueError:
+        whole = None
+    if whole != shape:
+        raise InputError(
+            f"observed site {name!r}",
+            f"values of shape {wanted}",
+            str(shape),
+            "Reshape the data or the model",
+        )
+
+
 def innermost(fn: Any) -> Any:
     """The distribution without what changes its shape, weight or support."""
     while hasattr(fn, "base_dist"):
         fn = fn.base_dist
     return fn
-
-
-def unnamed_axes(site: str, count: int) -> tuple[str, ...]:
-    """Names of the axes of a site, or of any array, that nothing names."""
-    return tuple(f"{site}{_UNNAMED}{i}" for i in range(count))
-
-
-def is_unnamed(axis: str) -> bool:
-    """Whether an axis got its name from its site alone, since nothing in the model names it."""
-    return _UNNAMED in axis
-
-
-def _axes(
-    name: str, shape: tuple[int, ...], frames: Sequence[Any], event_dim: int, notes: Metadata
-) -> tuple[str, ...]:
-    declared = notes.axes.get(name)
-    if declared is not None:
-        if len(declared) != len(shape):
-            raise InputError(
-                f"axes of site {name!r}",
-                f"{len(shape)} names for shape {shape}",
-                f"{len(declared)}: {', '.join(declared)}",
-                "Name every dimension, first to last.",
-            )
-        return declared
-    axes = list(unnamed_axes(name, len(shape)))
-    for frame in frames:
-        position = len(shape) - event_dim + frame.dim
-        if 0 <= position < len(shape) and shape[position] == frame.size:
-            axes[position] = frame.name
-    return tuple(axes)
 
 
 def _argument(name: str, value: Any, data: Data) -> str | None:

@@ -21,7 +21,8 @@ import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Float
 
 from dtprob.errors import InputError, nearest
-from dtprob.models.declaration import Model, model
+from dtprob.models.arguments import Model
+from dtprob.models.declaration import model
 from dtprob.models.dirichlet import LogDirichlet
 
 type Columns = Mapping[str, Array]

@@ -13,7 +13,7 @@ from numpyro import handlers
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.rewriting import Rewriting, may_become
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 from dtprob.testing.contract import expect, same
 
 type Trace = Mapping[str, Mapping[str, Any]]

@@ -12,7 +12,9 @@ import numpyro
 
 from dtprob.inference.build import build_target
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Declaration, Model, declare, is_unnamed, trace_model
+from dtprob.models.arguments import Model
+from dtprob.models.axes import is_unnamed
+from dtprob.models.declaration import Declaration, declare, trace_model
 from dtprob.testing.contract import expect, same
 
 _POINTS = 8

@@ -14,7 +14,8 @@ from numpyro import handlers
 from numpyro.infer.util import compute_log_probs
 
 from dtprob.errors import InputError
-from dtprob.models.declaration import Data, Model, declare, split_static
+from dtprob.models.arguments import Data, Model, split_static
+from dtprob.models.declaration import declare
 
 type Likelihoods = dict[str, Float[np.ndarray, "draw window"]]
 

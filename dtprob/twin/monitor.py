@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from dtprob.errors import InputError, unknown_name
-from dtprob.models.declaration import Data, Model
+from dtprob.models.arguments import Data, Model
 from dtprob.twin import statistics
 from dtprob.twin.likelihood import Likelihoods, window_likelihoods
 

@@ -10,7 +10,7 @@ from dtprob.inference import Posterior
 from dtprob.inference.build import build_target
 from dtprob.inference.circular import arc_interval
 from dtprob.inference.target import Inputs, Target
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 UNIDENTIFIED: Final = 0.1
 """A contraction below this is that of data that say nothing."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from dtprob.data import ChannelData, Labels, NetworkLog, PowerData
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from dtprob.effects import Effect, catalogue, summaries, with_effects
 from dtprob.errors import InputError, unknown_name
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
-from dtprob.models.declaration import Model, declare
+from dtprob.models.arguments import Model
+from dtprob.models.declaration import declare
 from dtprob.usercode import load_object
 from dtprob.workflow.models import MODELS
 from dtprob.workflow.scene import reached

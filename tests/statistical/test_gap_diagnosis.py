@@ -22,7 +22,8 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.which.confirm import confirm
 from dtprob.inference import NUTS, Laplace
-from dtprob.models.declaration import model, split_static
+from dtprob.models.arguments import split_static
+from dtprob.models.declaration import model
 from tests.unit.gap.examples import (
     SIGMA,
     bend,

@@ -16,7 +16,7 @@ from dtprob.gap.tails import family_wise, gamma_tail
 from dtprob.gap.view import view
 from dtprob.gap.where.locate import locate
 from dtprob.gap.which.screen import screen
-from dtprob.models.declaration import split_static
+from dtprob.models.arguments import split_static
 from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation
 
 EFFECTS = (bend(), ripple(), ripple("ripple5", 5.0), pair(), saturation(), jitter())

@@ -37,12 +37,6 @@ class Active:
         return np.concatenate(parts) if parts else np.zeros(0, int)
 
     @property
-    def base_index(self) -> np.ndarray:
-        """Positions of those of them that are the base model's."""
-        parts = [b.index[0] for b in self.blocks if not b.local and b.owner is None]
-        return np.concatenate(parts) if parts else np.zeros(0, int)
-
-    @property
     def local_index(self) -> np.ndarray:
         """Positions of the local coordinates, (cluster, local)."""
         parts = [b.index for b in self.blocks if b.local]

@@ -21,6 +21,8 @@ MOST: Final = 128
 class Centred(NamedTuple):
     """With W the tangents (row, own) of a cluster's own unknowns, what W (W' W)^-1 is at the fit and at the centre.
 
+    Of states that clusters share there is one W, with the rows of all clusters.
+
     Attributes:
         x: the flat vector of the fit, own unknowns at the centre of their prior.
         own: W at the fit (cluster, row, own).
@@ -40,17 +42,26 @@ class Centred(NamedTuple):
 
     def without_own(self, rows: np.ndarray) -> np.ndarray:
         """Rows (n, cluster, row) less what own unknowns could make of them."""
-        return rows - rows_of_each(self.here, scores_of_each(self.own, rows))
+        each = self._each(rows)
+        return (each - rows_of_each(self.here, scores_of_each(self.own, each))).reshape(rows.shape)
 
     def split(self, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rows (n, cluster, row) whose slopes are to be taken at the fit, and those at the centre."""
-        found = scores_of_each(self.own, rows)
-        return rows - rows_of_each(self.here, found), rows_of_each(self.there, found)
+        each = self._each(rows)
+        found = scores_of_each(self.own, each)
+        parts = each - rows_of_each(self.here, found), rows_of_each(self.there, found)
+        return parts[0].reshape(rows.shape), parts[1].reshape(rows.shape)
 
     def columns(self, here: np.ndarray, there: np.ndarray) -> np.ndarray:
         """Tangents (cluster, row, k) of effects from those at the fit and those at the centre."""
-        own, centre = np.swapaxes(self.here, 1, 2) @ here, np.swapaxes(self.there, 1, 2) @ there
-        return here + self.own @ (centre - own)
+        shape = (*self.own.shape[:2], here.shape[-1])
+        own = np.swapaxes(self.here, 1, 2) @ here.reshape(shape)
+        centre = np.swapaxes(self.there, 1, 2) @ there.reshape(shape)
+        return here + (self.own @ (centre - own)).reshape(here.shape)
+
+    def _each(self, rows: np.ndarray) -> np.ndarray:
+        """Rows (n, cluster, row) as those of each W."""
+        return rows.reshape(len(rows), *self.own.shape[:2])
 
 
 def per_unit(own: np.ndarray) -> np.ndarray:

@@ -26,9 +26,8 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
     if problem.volume is not None and n:
-        base, weights = active.base_index, np.asarray(active.weights)
-        place = np.isin(g_index, base)
-        prior_gradient[base] += weights @ problem.volume.gradient(x[base])
+        weights, place = np.asarray(active.weights), np.isin(g_index, problem.volume.index)
+        prior_gradient[problem.volume.index] += weights @ problem.volume.gradient(x)
         curvature[np.ix_(place, place)] -= np.tensordot(weights, problem.volume.bend, 1)
     cross = cross + np.moveaxis(hessian[:n][:, l_index], 0, 1)
     local = local + np.moveaxis(hessian[n:][:, l_index], 0, 1)
@@ -71,8 +70,8 @@ def value_of(problem: Problem, active: Active, x: np.ndarray) -> float:
 
 
 def volume_of(problem: Problem, active: Active, x: np.ndarray) -> float:
-    """What integrating the clusters' own unknowns out adds, where a problem asks for it."""
-    return 0.0 if problem.volume is None else float(active.weights @ problem.volume.at(x[active.base_index]))
+    """What integrating unknowns out adds, where a problem asks for it."""
+    return 0.0 if problem.volume is None else float(active.weights @ problem.volume.at(x))
 
 
 def moved(active: Active, x: np.ndarray, step: NewtonStep) -> np.ndarray:

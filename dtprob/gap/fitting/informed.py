@@ -13,7 +13,7 @@ import numpyro
 from numpyro import handlers
 
 from dtprob.gap.model.layout import fold, transform_of
-from dtprob.models.declaration import Model
+from dtprob.models.arguments import Model
 
 
 def informed(model: Model, known: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Model:

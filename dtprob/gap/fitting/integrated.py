@@ -13,12 +13,14 @@ from typing import Final
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.marginal import own_mode
+from dtprob.gap.fitting.states import held, states, states_mode
 from dtprob.gap.fitting.sweep import turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.volume import Volume
@@ -53,20 +55,20 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     Raises:
         InputError: the model has no finite likelihood from any start; what breaks is named.
     """
-    active = activate(problem)
-    if not active.local_index.shape[1] or not len(active.global_index):
+    shared, has_states = held(problem), bool(states(problem).blocks)
+    if not (has_states or activate(problem).local_index.shape[1]) or not len(shared):
         return Start(problem, fit_base(problem, key, polished=polished))
     centre, deviation = problem.prior_middle
-    scale = np.maximum(deviation[active.global_index], 1e-12)
+    scale = np.maximum(deviation[shared], 1e-12)
     centre = turned(problem, centre, problem.compiled.by_cluster)
-    first, starts, step = fit(problem, centre), [centre], _STEPS[0] * scale
-    if not _runs_away(problem, first, centre, scale):
+    starts, step = [centre], _STEPS[0] * scale
+    if not has_states and not _runs_away(problem, fit(problem, centre), centre, scale):
         joint = fit_base(problem, key, polished=polished)
         if not _runs_away(problem, joint, centre, scale):
             if _is_near_the_marginal_one(problem, joint, step):
                 return Start(problem, joint)
             starts.append(joint.x)
-    say("integrating out what each cluster has of its own")
+    say(f"integrating out {'states' if has_states else 'what each cluster has of its own'}")
     here, height = max((_height(problem, x) for x in starts), key=lambda found: found[1])
     here, height, volume = _about_the_mode(problem, here, height, scale)
     whole = problem.with_volume(volume)
@@ -97,7 +99,7 @@ def _about_the_mode(
     problem: Problem, here: np.ndarray, height: float, scale: np.ndarray
 ) -> tuple[np.ndarray, float, Volume]:
     """The mode of the marginal density, the log density and the expansion there, from a point and the density there."""
-    shared = activate(problem).global_index
+    shared = held(problem)
     for _ in range(_ROUNDS):
         volume = _expanded(problem, here, _STEPS[0] * scale)
         move = (fit(problem.with_volume(volume), here).x - here)[shared]
@@ -117,19 +119,30 @@ def _about_the_mode(
 
 
 def _height(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, float]:
-    """The point with each cluster's own unknowns at their mode, and the log density with these integrated out."""
-    active = activate(problem)
-    x, local = own_mode(problem, active, x)
-    total = float(terms_of(problem, active, x).sum()) - 0.5 * float(np.linalg.slogdet(local)[1].sum())
+    """The point with what is integrated out at its mode, and the log density without it."""
+    x, volume = _inner(problem, x)
+    total = float(terms_of(problem, activate(problem), x).sum()) + float(volume.sum())
     return x, total if np.isfinite(total) else -np.inf
 
 
+def _inner(
+    problem: Problem, x: np.ndarray, tolerance: float = 1e-3
+) -> tuple[np.ndarray, Float[np.ndarray, " cluster"]]:
+    """The point with what is integrated out, states or the clusters' own unknowns, at its mode, and V_c there."""
+    shared_states = states(problem)
+    if shared_states.blocks:
+        x, curvature = states_mode(problem, shared_states, x, tolerance=tolerance)
+        volume = -0.5 * np.linalg.slogdet(curvature)[1]
+        return x, np.full(problem.n_cluster, volume / problem.n_cluster)
+    x, local = own_mode(problem, activate(problem), x, tolerance=tolerance)
+    return x, -0.5 * np.linalg.slogdet(local)[1]
+
+
 def _volume_at(problem: Problem, x: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """V_c (cluster,) where the shared coordinates are moved from a point, the clusters' own ones following."""
-    active, moved = activate(problem), x.copy()
-    moved[active.global_index] += move
-    local = own_mode(problem, active, moved, tolerance=_EXACT)[1]
-    return -0.5 * np.linalg.slogdet(local)[1]
+    """V_c (cluster,) where the shared coordinates are moved from a point, what is integrated out following."""
+    moved = x.copy()
+    moved[held(problem)] += move
+    return _inner(problem, moved, _EXACT)[1]
 
 
 def _beside(problem: Problem, x: np.ndarray, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -154,4 +167,5 @@ def _expanded(problem: Problem, x: np.ndarray, step: np.ndarray) -> Volume:
     value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
     values, vectors = np.linalg.eigh(bend)
     bend = np.einsum("cij,cj,ckj->cik", vectors, np.minimum(values, 0.0), vectors)
-    return Volume(x[activate(problem).global_index], value, slope / step, bend / np.outer(step, step))
+    shared = held(problem)
+    return Volume(shared, x[shared], value, slope / step, bend / np.outer(step, step))

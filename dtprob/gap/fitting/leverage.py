@@ -1,8 +1,8 @@
-"""What fitting each cluster's own unknowns takes off the rows that tell of spreads.
+"""What fitting unknowns that are integrated out takes off the rows that tell of spreads.
 
-At the mode of a cluster's own unknowns the residual of reading i has the variance 1 - h_i, h_i its leverage, so these
-rows are too low on average, most where a cluster has few readings. Data sets drawn at the fit are not refitted,
-and have none of it. What is lost is the slope of -1/2 log |H|, H the curvature of a cluster's own unknowns, which
+At the mode of a cluster's own unknowns, or of states, the residual of reading i has the variance 1 - h_i, h_i its leverage,
+so these rows are too low on average, most where a cluster has few readings. Data sets drawn at the fit are not refitted,
+and have none of it. What is lost is the slope of -1/2 log |H|, H the curvature of these unknowns, which
 integrating them out by Laplace's method adds to the log density (Tierney and Kadane 1986).
 """
 
@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from dtprob.gap.fitting.active import activate, own_basis
+from dtprob.gap.fitting.active import Active, activate, basis, own_basis
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
+from dtprob.gap.fitting.states import states
 from dtprob.gap.model.problem import Problem
 
 
@@ -29,15 +30,24 @@ def lost(problem: Problem, fitted: Fit, projection: Projection) -> Float[np.ndar
         fitted: the fit.
         projection: there.
     """
-    own = projection.local_columns
-    if not own.shape[-1]:
-        return np.zeros(own.shape[:2])
-    along = own_basis(problem, activate(problem, fitted.effects, spread=fitted.spread))
+    active = activate(problem, fitted.effects, spread=fitted.spread)
+    weights, along = _integrated(problem, active, projection)
+    if not len(along):
+        return np.zeros(weights.shape[:2])
     rows = {}
-    for name, slope in problem.compiled.bend(fitted.x, own @ projection.local_inverse, along).items():
+    for name, slope in problem.compiled.bend(fitted.x, weights, along).items():
         part, located = np.zeros((problem.components[name], *slope.shape)), problem.located[name]
         if located < len(part):
             part[located] = -np.asarray(slope)
         rows[name] = jnp.asarray(part)
     found = np.asarray(problem.rows.stack(rows))
     return found if np.isfinite(found).all() else np.zeros_like(found)
+
+
+def _integrated(problem: Problem, active: Active, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
+    """Tangents times the covariance (cluster, row, k) of what is integrated out, and its directions (k, dimension)."""
+    inner = np.isin(active.global_index, states(problem).global_index)
+    if not inner.any():
+        return projection.local_columns @ projection.local_inverse, own_basis(problem, active)
+    columns = projection.columns[..., inner]
+    return columns @ projection.alone(inner), basis(problem, active)[: len(inner)][inner]

@@ -14,6 +14,7 @@ from dtprob.gap.fitting.active import Active, activate, basis, effect_prior
 from dtprob.gap.fitting.centred import MOST, Centred
 from dtprob.gap.fitting.columns import apart, product, rows_of, rows_of_each, scores
 from dtprob.gap.fitting.newton import positive
+from dtprob.gap.fitting.states import states
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
 
@@ -84,6 +85,13 @@ class Projection:
             for which, part in enumerate((self.shared, self.own))
         )
         return rows + rows_of(self.columns, shared) + rows_of_each(self.local_columns, own)
+
+    def alone(self, chosen: np.ndarray) -> np.ndarray:
+        """Covariance of some of the global coordinates, chosen by a mask (global,), the others of them held."""
+        both = np.ix_(chosen, chosen)
+        across = self.global_inverse[chosen][:, ~chosen]
+        held = np.linalg.solve(self.global_inverse[np.ix_(~chosen, ~chosen)], across.T)
+        return self.global_inverse[both] - across @ held
 
     def rows(self, e: np.ndarray) -> np.ndarray:
         """Rows (..., cluster, row) after the linearised refit of all nuisances."""
@@ -159,8 +167,11 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     )
     shared = _known(slope[active.global_index], prior_global, np.einsum("cmg,cmg->g", w_global, w_global))
     own = _known(slope[active.local_index], prior_local, np.einsum("cml,cml->cl", w_local, w_local))
-    w_global, centre = _centred(
-        problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own
+    inner = np.isin(active.global_index, states(problem).global_index)
+    w_global, centre = (
+        _centred_on_states(problem, active, fitted.x, directions, w=w_global, inner=inner, shared=shared)
+        if problem.volume is not None and inner.any()
+        else _centred(problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own)
     )
     transposed = np.swapaxes(w_local, 1, 2)
     local = transposed @ w_local + prior_local
@@ -175,6 +186,33 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     return Projection(w_global, w_local, local_inverse, inverse, reduced, shared, own, origin, centre)
 
 
+def _centred_on_states(
+    problem: Problem,
+    active: Active,
+    x: np.ndarray,
+    directions: np.ndarray,
+    *,
+    w: np.ndarray,
+    inner: np.ndarray,
+    shared: Known,
+) -> tuple[np.ndarray, Centred | None]:
+    """The same where the global coordinates of a mask are states that are integrated out."""
+    there = x.copy()
+    there[active.global_index] -= np.where(inner, shared.deviation, 0.0)
+    moved = np.asarray(problem.compiled.linearised(there, directions[: len(inner)])[1])
+    if not np.isfinite(moved).all():
+        return w, None
+    centre = Centred.of(there, _together(w[..., inner]), _together(moved[..., inner]))
+    columns = w.copy()
+    columns[..., ~inner] = centre.columns(w[..., ~inner], moved[..., ~inner])
+    return columns, centre
+
+
+def _together(w: np.ndarray) -> np.ndarray:
+    """Tangents (1, cluster and row, k) of what acts on all clusters."""
+    return w.reshape(1, -1, w.shape[-1])
+
+
 def _centred(
     problem: Problem,
     active: Active,
@@ -187,7 +225,7 @@ def _centred(
 ) -> tuple[np.ndarray, Centred | None]:
     """Tangents of the global coordinates, that go through the clusters' own as spread, not as a shift; the centre."""
     n, wanted = w_global.shape[2], own.root.any() and w_local.shape[2] <= MOST
-    if not wanted and problem.volume is None:
+    if not w_local.shape[2] or not (wanted or problem.volume):
         return w_global, None
     there = x.copy()
     there[active.local_index] -= own.deviation

@@ -11,6 +11,7 @@ from dtprob.errors import InputError
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import project
+from dtprob.gap.fitting.states import states
 from dtprob.gap.model.problem import Problem
 
 UNSEEN: Final = "nothing observed depends on it"
@@ -97,7 +98,9 @@ def _misfit(problem: Problem, fitted: Fit) -> list[str]:
 
 def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
     """Parameters that the data do not determine: too few clusters, no information, or only a combination of them."""
-    blocks = [b for b in activate(problem, fitted.effects).blocks if not b.local]
+    active = activate(problem, fitted.effects)
+    inner = {b.name for b in states(problem).blocks}
+    blocks = [b for b in active.blocks if not b.local and b.name not in inner]
     owners = [b.name if b.size == 1 else f"{b.name}[{j}]" for b in blocks for j in range(b.size)]
     if not owners:
         return []
@@ -108,7 +111,8 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
             " a cause closes the gap"
         )
     projection = project(problem.with_volume(None), fitted)  # what acts through the clusters' own is seen too
-    columns, reduced = projection.columns, projection.reduced
+    asked = ~np.isin(active.global_index, states(problem).global_index)
+    columns, reduced = projection.columns[..., asked], projection.reduced[..., asked]
     total = np.einsum("cmi,cmi->i", columns, columns)
     seen = total > 0
     if not seen.all():

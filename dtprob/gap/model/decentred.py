@@ -24,7 +24,8 @@ from numpyro.infer.reparam import LocScaleReparam, Reparam
 from numpyro.primitives import Messenger
 
 from dtprob.effects.changing import is_scan
-from dtprob.models.declaration import Data, Model, base_constraint, innermost, split_static, trace_model
+from dtprob.models.arguments import Data, Model, split_static
+from dtprob.models.declaration import base_constraint, innermost, trace_model
 
 _SCALED = {"loc", "scale"}
 

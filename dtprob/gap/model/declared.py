@@ -9,7 +9,8 @@ from typing import Any
 import equinox as eqx
 import jax
 
-from dtprob.models.declaration import Data, Declaration, Model, trace_model
+from dtprob.models.arguments import Data, Model
+from dtprob.models.declaration import Declaration, trace_model
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from dtprob.gap.model.running import Outcome, Runner
 from dtprob.gap.observation import whiten
 from dtprob.gap.observation.likelihoods import likelihood
-from dtprob.models.declaration import Data, metadata
+from dtprob.models.arguments import Data
+from dtprob.models.declaration import metadata
 
 _DECIBELS: Final = 10.0 / math.log(10.0)
 

@@ -1,10 +1,10 @@
-"""Effects of the user's own that change the model where they should do nothing."""
+"""Effects of the user's own that change the model where they should do nothing, or that are no numbers there."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from dtprob.effects.effect import Context
+from dtprob.effects.effect import Context, Effect
 from dtprob.effects.library import FAMILIES
 from dtprob.effects.rewriting import rewritten
 from dtprob.errors import InputError
@@ -18,7 +18,7 @@ def check_nulls(problem: Problem) -> None:
     """Look at each mean effect whose family the library lacks: at its null, sites have to stay what they are.
 
     Raises:
-        InputError: one changes a site there.
+        InputError: one changes a site there, or makes it infinite or not a number.
     """
     own = [e for e in problem.effects if e.kind == "mean" and e.family not in FAMILIES]
     if not own:
@@ -30,6 +30,7 @@ def check_nulls(problem: Problem) -> None:
         for site in effect.rewrites:
             before = np.asarray(values[site])
             after = np.asarray(rewritten(effect, site, values[site], effect.null(), context))
+            _check_finite(effect, site, before, after)
             size, off = (np.abs(v[np.isfinite(v)]).max(initial=0.0) for v in (before, after - before))
             if off > _ROUNDING * size:
                 raise InputError(
@@ -38,6 +39,20 @@ def check_nulls(problem: Problem) -> None:
                     f"up to {off:.3g} away from values up to {size:.3g}",
                     "Make the rewrite the identity there, or give the parameter another null",
                 )
+
+
+def _check_finite(effect: Effect, site: str, before: np.ndarray, after: np.ndarray) -> None:
+    """A column with a missing value would make the effect's score nothing."""
+    before = np.broadcast_to(before, np.broadcast_shapes(before.shape, after.shape))
+    lost = np.isfinite(before) & ~np.isfinite(after)
+    if lost.any():
+        read = ", ".join(effect.requires) or "the columns that it reads"
+        raise InputError(
+            f"effect {effect.name}",
+            f"finite values of site {site!r}",
+            f"{int(lost.sum())} of {lost.size} that are not",
+            f"Look for missing values in {read}; leave those rows out or fill them",
+        )
 
 
 def _named(values: dict[str, object]) -> str:

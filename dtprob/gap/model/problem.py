@@ -19,6 +19,7 @@ import numpy as np
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.errors import InputError
 from dtprob.gap.model import own
+from dtprob.gap.model.angles import unrolled
 from dtprob.gap.model.compiled import Compiled
 from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
@@ -33,7 +34,8 @@ from dtprob.gap.model.shapes import latent_shapes, observed_shapes, perturbed_si
 from dtprob.gap.model.volume import Volume
 from dtprob.gap.observation import whiten
 from dtprob.inference.posterior import Sampler
-from dtprob.models.declaration import Data, Declaration, Model, declare, split_static
+from dtprob.models.arguments import Data, Model, as_arrays, split_static
+from dtprob.models.declaration import Declaration, declare
 
 _REFERENCE_DRAWS = 1000
 _MIDDLE = 2.563
@@ -63,12 +65,14 @@ class Problem:
         cluster: str | None = None,
         reference: Sampler | None = None,
     ) -> None:
-        self.data, self.effects = dict(data), tuple(effects)
+        data = as_arrays(data)
+        self.data, self.effects = data, tuple(effects)
         self.arrays, static = split_static(data)
         self.column = (
             cluster if cluster is not None and cluster in data and np.ndim(data[cluster]) == 1 else None
         )
         self._cluster = None if self.column else cluster
+        model = unrolled(model, data)
         self._declare(model, static)
         self._check_effects()
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}

@@ -20,7 +20,7 @@ from dtprob.gap.model.rewrites import (
     place_scores,
     trial_shifts,
 )
-from dtprob.models.declaration import Data, split_static
+from dtprob.models.arguments import Data, split_static
 
 TRIALS: Final = 16
 """Sizes of each effect that are tried in one run."""

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.errors import InputError
-from dtprob.models.declaration import Data, Declaration, Site
+from dtprob.models.arguments import Data
+from dtprob.models.declaration import Declaration, Site
 
 
 @dataclass(frozen=True)

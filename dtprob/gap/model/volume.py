@@ -1,34 +1,38 @@
-"""What integrating the clusters' own unknowns out adds to the density of the shared ones, to second order."""
+"""What integrating unknowns out adds to the density of the others, to second order."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 
 @dataclass(frozen=True)
 class Volume:
-    """Expansion of V_c = -1/2 log |H_c| in the base model's shared coordinates, H_c the curvature of a cluster's own ones.
+    """Expansion of V_c = -1/2 log |H_c| in what clusters of the base model share.
+
+    H_c is the curvature of a cluster's own unknowns; of states that they share, V_c is the part that a cluster is given.
 
     Attributes:
-        centre: the shared coordinates about which it is expanded.
+        index: positions of the shared coordinates in a flat vector.
+        centre: these, about which it is expanded.
         value: V_c there.
         slope: first derivatives.
         bend: second derivatives, none of them upwards.
     """
 
+    index: Int[np.ndarray, " shared"]
     centre: Float[np.ndarray, " shared"]
     value: Float[np.ndarray, " cluster"]
     slope: Float[np.ndarray, "cluster shared"]
     bend: Float[np.ndarray, "cluster shared shared"]
 
-    def at(self, shared: Float[np.ndarray, " shared"]) -> Float[np.ndarray, " cluster"]:
-        """V_c at shared coordinates."""
-        moved = shared - self.centre
+    def at(self, x: Float[np.ndarray, " dimension"]) -> Float[np.ndarray, " cluster"]:
+        """V_c at a flat vector."""
+        moved = x[self.index] - self.centre
         return self.value + self.slope @ moved + 0.5 * (self.bend @ moved) @ moved
 
-    def gradient(self, shared: Float[np.ndarray, " shared"]) -> Float[np.ndarray, "cluster shared"]:
+    def gradient(self, x: Float[np.ndarray, " dimension"]) -> Float[np.ndarray, "cluster shared"]:
         """Its derivatives there."""
-        return self.slope + self.bend @ (shared - self.centre)
+        return self.slope + self.bend @ (x[self.index] - self.centre)

@@ -17,7 +17,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design import Design, Prediction, Ranked, joined, rank, recommend
 from dtprob.gap.observation import whiten
 from dtprob.gap.which.trials import Start
-from dtprob.models.declaration import Data
+from dtprob.models.arguments import Data
 
 _SHOWN: Final = 5
 """Designs that a report lists."""

@@ -12,7 +12,8 @@ import numpy as np
 from scipy import sparse, stats
 
 from dtprob.gap.model.problem import Problem
-from dtprob.models.declaration import Site, is_unnamed
+from dtprob.models.axes import is_unnamed
+from dtprob.models.declaration import Site
 
 _SMOOTH_FROM: Final = 6
 _ORDER: Final = 4

@@ -10,15 +10,8 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.errors import InputError
-from dtprob.models.declaration import (
-    declare,
-    metadata,
-    model,
-    model_name,
-    select_arguments,
-    split_static,
-    trace_model,
-)
+from dtprob.models.arguments import model_name, select_arguments, split_static
+from dtprob.models.declaration import declare, metadata, model, trace_model
 
 DATA = {"x": jnp.arange(6.0).reshape(3, 2), "degree": 2, "y": jnp.zeros((3, 2))}
 
@@ -104,3 +97,42 @@ def test_a_model_without_an_observation():
 
     with pytest.raises(InputError, match="observed site"):
         declare(prior, {"x": DATA["x"]})
+
+
+def outside(distance, height, y=None):
+    """Sites that are computed before a plate opens."""
+    slope = numpyro.sample("slope", dist.Normal())
+    mean = numpyro.deterministic("mean", slope * distance)
+    numpyro.deterministic("curve", slope * jnp.arange(4.0))
+    if mean.ndim > 1:
+        numpyro.deterministic("of_row", mean.sum(axis=1, keepdims=True))
+    with numpyro.plate_stack("place", mean.shape):
+        numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+def test_what_is_computed_outside_of_a_plate_has_the_axes_of_what_is_observed():
+    """Or no column of the data would be looked at along it."""
+    found = declare(outside, {"distance": jnp.ones(5), "height": jnp.ones(5), "y": jnp.ones(5)})
+    assert found.sites["mean"].axes == found.sites["y"].axes
+    assert found.sites["curve"].axes == ("curve_dim_0",)
+    found = declare(outside, {"distance": jnp.ones((5, 3)), "height": jnp.ones(5), "y": jnp.ones((5, 3))})
+    assert found.sites["mean"].axes == found.sites["y"].axes
+    assert found.sites["of_row"].axes == (found.sites["y"].axes[0], "of_row_dim_1")
+
+
+def test_where_observed_sites_do_not_agree_an_axis_has_no_name():
+    def two(y, z):
+        mean = numpyro.deterministic("mean", jnp.ones(5) * numpyro.sample("a", dist.Normal()))
+        with numpyro.plate("one", 5):
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+        with numpyro.plate("other", 5):
+            numpyro.sample("z", dist.Normal(mean, 1.0), obs=z)
+
+    assert declare(two, {"y": jnp.ones(5), "z": jnp.ones(5)}).sites["mean"].axes == ("mean_dim_0",)
+
+
+def test_values_of_another_shape_than_the_distribution_are_refused():
+    data = {"distance": jnp.ones(5), "height": jnp.ones(5)}
+    for wrong in (jnp.ones((5, 1)), jnp.ones(4)):
+        with pytest.raises(InputError, match=r"observed site 'y': expected values of shape \(5,\)"):
+            declare(outside, {**data, "y": wrong})

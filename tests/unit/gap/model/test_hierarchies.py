@@ -9,7 +9,6 @@ import pytest
 from numpyro.contrib.control_flow import cond, scan
 
 from dtprob.effects.effect import Effect, Parameter
-from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting.integrated import based
 from dtprob.gap.model.decentred import decentred
@@ -220,17 +219,3 @@ def test_what_all_clusters_share_of_a_series_is_no_gap(kind):
         drifting, of_rooms(kind), [heavy()], cluster="room", engine=Laplace(), key=jax.random.key(0)
     )
     assert found.verdict == "NO_GAP"
-
-
-def test_more_unknowns_than_data_are_refused():
-    def series(load, y=None):
-        spread = numpyro.sample("spread", dist.HalfNormal(1.0))
-        with numpyro.plate("hour", len(load)):
-            level = numpyro.sample("level", dist.Normal(0.0, 1.0))
-        mean = numpyro.deterministic("mean", spread * jnp.cumsum(level))
-        with numpyro.plate("reading", len(load)):
-            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
-
-    data = {"load": jnp.ones(50), "y": jnp.zeros(50)}
-    with pytest.raises(InputError, match="fewer unknowns than the 50 observed values, got 51"):
-        diagnose(series, data, [heavy()], cluster="reading", engine=Laplace(), key=jax.random.key(0))

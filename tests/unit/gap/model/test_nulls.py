@@ -1,5 +1,6 @@
 """Effects that change the model where they should do nothing are refused; those that do nothing are not."""
 
+import numpy as np
 import numpyro.distributions as dist
 import pytest
 
@@ -34,3 +35,20 @@ def test_a_constant_that_is_always_added_is_refused():
 
 def test_effects_that_do_nothing_there_pass():
     check_nulls(Problem(line, draw("line"), [bend(), bump(), gusty(), scaled(1.0)]))
+
+
+def test_a_missing_value_in_a_column_of_an_effect_is_told():
+    data = draw("line")
+    data = {**data, "x": data["x"]}
+    marks = np.zeros(np.shape(data["x"]))
+    marks.reshape(-1)[3] = np.nan
+    marked = Effect(
+        "marked",
+        {"mean": lambda v, p, c: v + p["by"] * marks},
+        (Parameter("by", dist.Normal()),),
+        requires=("mark",),
+    )
+    with pytest.raises(
+        InputError, match=r"effect marked: expected finite values of site 'mean', got 1 of .* in mark"
+    ):
+        check_nulls(Problem(line, data, [marked]))

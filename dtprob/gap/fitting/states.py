@@ -1,0 +1,69 @@
+"""States that clusters share, about as many as there are data, as of one long series: found together, and integrated out.
+
+The mode of such states and of what they all share at once lets the noise vanish. Integrated out by Laplace's method they
+add V = -1/2 log |H| to the log density, H their curvature, of which each cluster is given the same part.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dtprob.gap.fitting.active import Active, activate
+from dtprob.gap.fitting.density import moved, system_at, value_of
+from dtprob.gap.fitting.newton import newton_step, positive
+from dtprob.gap.model.problem import Problem
+
+_MANY: Final = 0.25
+"""Shared unknowns for each observed value from which the largest of them are integrated out."""
+_LARGE: Final = 32
+"""Entries of an unknown from which they are states."""
+_NORMAL: Final = ("Normal", "MultivariateNormal", "GaussianRandomWalk")
+"""Distributions of states."""
+
+
+def states(problem: Problem) -> Active:
+    """The states of the base model as the only free coordinates; none where there are few for the data."""
+    active = activate(problem)
+    shared = [b for b in active.blocks if not b.local]
+    sites = problem.declaration.sites
+    large = [b for b in shared if b.size >= _LARGE and sites[b.name].distribution in _NORMAL]
+    many = sum(b.size for b in shared) >= _MANY * problem.n_observation
+    return replace(active, blocks=tuple(large) if many else ())
+
+
+def held(problem: Problem) -> Int[np.ndarray, " shared"]:
+    """Positions of what the base model's clusters share besides states."""
+    return np.setdiff1d(activate(problem).global_index, states(problem).global_index)
+
+
+def states_mode(
+    problem: Problem, active: Active, x: np.ndarray, *, steps: int = 20, tolerance: float = 1e-3
+) -> tuple[Float[np.ndarray, " dimension"], Float[np.ndarray, "state state"]]:
+    """The point with states at their mode given all else, and their curvature there.
+
+    Args:
+        problem: the model on its data, nothing of it integrated out.
+        active: the states.
+        x: where to start.
+        steps: at most so many Gauss-Newton steps.
+        tolerance: stop when the gain that a step promises, in nats, falls below.
+    """
+    lowest = np.full(len(active.global_index), -np.inf)
+    damping, value = 0.0, value_of(problem, active, x)
+    system = system_at(problem, active, x)
+    for _ in range(steps):
+        step = newton_step(system, damping, lowest)
+        trial = moved(active, x, step)
+        new = value_of(problem, active, trial)
+        if new > value:
+            x, value, damping = trial, new, damping / 8
+            system = system_at(problem, active, x)
+        else:
+            damping = max(4 * damping, 1e-3)
+        if step.gain < tolerance:
+            break
+    return x, positive(system.curvature)

@@ -1,0 +1,99 @@
+"""The arguments that a model is given: columns of numbers, and settings."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Mapping
+from typing import Any, Final, cast
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from dtprob.errors import InputError, nearest
+
+type Data = Mapping[str, Any]
+type Model = Callable[..., Any]
+
+_ARRAYS: Final = (jax.Array, np.ndarray, np.generic)
+_NUMBERS: Final = "biufc"
+"""Kinds of dtypes."""
+
+
+def model_name(function: Model) -> str:
+    """The model's name in reports and files."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def as_arrays(data: Data) -> dict[str, Any]:
+    """Data whose columns are arrays: lists of numbers and what turns into an array, as columns of pandas, are converted.
+
+    Raises:
+        InputError: a column holds text or other objects.
+    """
+    return {name: _column(name, entry) for name, entry in dict(data).items()}
+
+
+def _column(name: str, entry: Any) -> Any:
+    is_array, is_column = isinstance(entry, _ARRAYS), hasattr(entry, "__array__")
+    if isinstance(entry, jax.Array) or (
+        isinstance(entry, np.ndarray | np.generic) and entry.dtype.kind in _NUMBERS
+    ):
+        return entry
+    if not (is_column or isinstance(entry, list)):
+        return entry
+    try:
+        array = np.asarray(np.asarray(entry).tolist())  # objects may be numbers all the same
+    except ValueError:  # lists of unequal lengths
+        return entry
+    if array.dtype.kind in _NUMBERS and array.size:
+        return array
+    if not (is_array or is_column):
+        return entry  # a list of words is a setting
+    raise InputError(
+        f"data {name!r}",
+        "numbers",
+        f"values such as {str(array.reshape(-1)[0])!r}" if array.size else "objects",
+        "Give each word a whole number (the first of pandas.factorize), or leave the column out.",
+    )
+
+
+def select_arguments(function: Model, data: Data) -> dict[str, Any]:
+    """The entries of `data` that the model takes, checked against its signature.
+
+    Raises:
+        InputError: a required argument is missing, or the data has an entry that the model does not take.
+    """
+    parameters = inspect.signature(function).parameters
+    takes_any = any(p.kind is p.VAR_KEYWORD for p in parameters.values())
+    for name in data:
+        if name not in parameters and not takes_any:
+            hint = nearest(name, parameters)
+            raise InputError(
+                f"data for {model_name(function)}",
+                f"arguments among {', '.join(parameters)}",
+                repr(name),
+                f"Did you mean {hint!r}?" if hint else "Remove it, or add the argument to the model.",
+            )
+    for name, parameter in parameters.items():
+        is_variadic = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+        if parameter.default is parameter.empty and not is_variadic and name not in data:
+            raise InputError(
+                f"data for {model_name(function)}",
+                f"an entry {name!r}",
+                ", ".join(data) or "nothing",
+                f"Give {name!r}, or a default in the model.",
+            )
+    return as_arrays(data)
+
+
+def split_static(data: Data) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Data as (arrays, everything else), so that arrays can be arguments of compiled functions.
+
+    Plain numbers are settings: a model may size a plate by them.
+    """
+    arrays, static = eqx.partition(as_arrays(data), lambda entry: isinstance(entry, _ARRAYS))
+    return cast("dict[str, Any]", arrays), cast("dict[str, Any]", static)
