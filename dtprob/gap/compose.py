@@ -286,18 +286,16 @@ def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
 def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
     """1 - posterior variance / prior variance of each global nuisance, in unconstrained coordinates."""
     problem, fitted = evidence.problem, evidence.base
-    position = {int(i): j for j, i in enumerate(fitted.global_index)}
+    deviation = problem.prior_middle[1].copy()
+    for name, (_, precision) in problem.known.items():
+        deviation[problem.layout[name].index.reshape(-1)] = np.sqrt(np.diag(np.linalg.inv(precision)))
+    change = np.zeros(problem.dimension)
+    variance = np.diag(fitted.covariance) / np.maximum(deviation[fitted.global_index], 1e-300) ** 2
+    change[fitted.global_index] = np.clip(1 - variance, 0.0, 1.0)
     result = {}
-    for block in problem.blocks_of(None):
-        if block.local:
-            continue
-        directions = np.zeros((block.size, problem.dimension))
-        directions[np.arange(block.size), block.index[0]] = 1.0
-        precision = np.einsum("ki,ki->k", problem.compiled.prior(fitted.x, directions)[1], directions)
-        variance = np.array([fitted.covariance[position[int(i)], position[int(i)]] for i in block.index[0]])
-        size = problem.declaration.sites[block.name].size
-        change = np.clip(1 - variance * np.maximum(precision, 0.0), 0.0, 1.0)
-        result[block.name] = change if len(change) == size else np.full(size, change.mean())
+    for block in (b for b in problem.blocks_of(None) if not b.local):
+        own, size = change[block.index[0]], problem.declaration.sites[block.name].size
+        result[block.name] = own if len(own) == size else np.full(size, own.mean())
     return result
 
 

@@ -68,13 +68,13 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         if any(_is_same(freed[-1], other) for other in freed[:-1]):
             break  # two starts that end in one mode
     best = max([*freed, *found[polished:]], key=lambda f: f.log_posterior)
-    best = settled(problem, best if best.converged else followed(problem, best))
+    best = settled(problem, followed(problem, best))
     return polish(problem, best, added) if added and not polished else best
 
 
 def followed(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
     """Where a fit that still climbs leads: along a bent ridge, as of a path's delay and its gain's phase, it crawls."""
-    for _ in range(_PATIENCE):
+    for _ in range(0 if fitted.converged else _PATIENCE):
         further = fitting.fit(problem, fitted.x, fitted.effects, spread=fitted.spread)
         gain, fitted = further.log_posterior - fitted.log_posterior, further
         if fitted.converged or gain < _SAME:

@@ -8,15 +8,16 @@ order, and every fit takes it along (Tierney and Kadane 1986; Rue, Martino and C
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import combinations
-from typing import Final
+from typing import Final, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Float
 
 from dtprob.gap.fitting.active import activate
-from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.base import fit_base, followed
 from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.marginal import own_mode
@@ -70,12 +71,21 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
             starts.append(joint.x)
     say(f"integrating out {'states' if has_states else 'what each cluster has of its own'}")
     here, height = max((_height(problem, x) for x in starts), key=lambda found: found[1])
-    here, height, volume = _about_the_mode(problem, here, height, scale)
-    whole = problem.with_volume(volume)
-    found = fit(whole, here)
-    if _height(problem, found.x)[1] < height - _ARRIVED:
-        found = fit(whole, here, steps=0)
+    mode = _about_the_mode(problem, here, height, scale)
+    whole = problem.with_volume(mode.volume)
+    found = followed(whole, fit(whole, mode.x))
+    if _height(problem, found.x)[1] < mode.height - _ARRIVED:
+        found = replace(fit(whole, mode.x, steps=0), converged=mode.arrived)
     return Start(whole, found)
+
+
+class _Mode(NamedTuple):
+    """Of the marginal density: where, its logarithm, the expansion there, and whether the last round gained nothing."""
+
+    x: np.ndarray
+    height: float
+    volume: Volume
+    arrived: bool
 
 
 def _is_near_the_marginal_one(problem: Problem, joint: Fit, step: np.ndarray) -> bool:
@@ -95,10 +105,8 @@ def _runs_away(problem: Problem, first: Fit, centre: np.ndarray, scale: np.ndarr
     return not first.converged and (lost or bool(away.max() > _RUNAWAY))
 
 
-def _about_the_mode(
-    problem: Problem, here: np.ndarray, height: float, scale: np.ndarray
-) -> tuple[np.ndarray, float, Volume]:
-    """The mode of the marginal density, the log density and the expansion there, from a point and the density there."""
+def _about_the_mode(problem: Problem, here: np.ndarray, height: float, scale: np.ndarray) -> _Mode:
+    """The mode of the marginal density, from a point and the log density there."""
     shared = held(problem)
     for _ in range(_ROUNDS):
         volume = _expanded(problem, here, _STEPS[0] * scale)
@@ -113,9 +121,9 @@ def _about_the_mode(
                 best, highest = trial, value
                 break
         if highest - height < _ARRIVED:
-            return here, height, volume
+            return _Mode(here, height, volume, arrived=True)
         here, height = best, highest
-    return here, height, _expanded(problem, here, _STEPS[0] * scale)
+    return _Mode(here, height, _expanded(problem, here, _STEPS[0] * scale), arrived=False)
 
 
 def _height(problem: Problem, x: np.ndarray) -> tuple[np.ndarray, float]:

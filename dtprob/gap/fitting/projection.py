@@ -101,7 +101,7 @@ class Projection:
     def adjust(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Effect columns (cluster, row, k) after projection, and B's part that falls on the global nuisances."""
         coefficients = self.global_inverse @ product(self.reduced, w)
-        return self._without_local(w, slice(None)) - self.reduced @ coefficients, coefficients
+        return self.without_own(w) - self.reduced @ coefficients, coefficients
 
     def information(self, w: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """W' P W and B's part that falls on the global nuisances, of effect columns W (cluster, row, k).
@@ -112,11 +112,11 @@ class Projection:
         coefficients = self.global_inverse @ product(self.reduced, w)
         found = np.zeros((w.shape[-1], w.shape[-1]))
         for c in parts:
-            adjusted = self._without_local(w[c], c) - self.reduced[c] @ coefficients
+            adjusted = self.without_own(w[c], c) - self.reduced[c] @ coefficients
             found += product(w[c], adjusted)
         return found, coefficients
 
-    def _without_local(self, w: np.ndarray, clusters: slice) -> np.ndarray:
+    def without_own(self, w: np.ndarray, clusters: slice = slice(None)) -> np.ndarray:
         """Columns (cluster, row, k) of some clusters, their local coordinates projected away."""
         own = self.local_columns[clusters]
         if not own.shape[-1]:

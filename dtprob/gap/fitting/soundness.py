@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 
 from dtprob.errors import InputError
-from dtprob.gap.fitting.active import activate
+from dtprob.gap.fitting.active import activate, basis
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.fitting.states import states
@@ -23,6 +23,8 @@ _SINGULAR: Final = 1e-8
 _TAKES_PART: Final = 0.2
 """Weight of a parameter in a direction from which on it is named."""
 _SHOWN: Final = 4
+_STEP: Final = 0.01
+"""Of a coordinate, to see what it acts on."""
 
 
 def broken(problem: Problem, starts: Sequence[np.ndarray]) -> InputError:
@@ -110,14 +112,18 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
             f"{problem.n_cluster} clusters for {len(owners)} fitted parameters: what is held out tells little of how far"
             " a cause closes the gap"
         )
-    projection = project(problem.with_volume(None), fitted)  # what acts through the clusters' own is seen too
     asked = ~np.isin(active.global_index, states(problem).global_index)
-    columns, reduced = projection.columns[..., asked], projection.reduced[..., asked]
+    columns = np.asarray(
+        problem.compiled.linearised(fitted.x, basis(problem, active)[: len(asked)][asked])[1]
+    )
+    reduced = project(problem, fitted).without_own(columns)  # what acts through the clusters' own is seen too
     total = np.einsum("cmi,cmi->i", columns, columns)
     seen = total > 0
-    if not seen.all():
+    told = seen.copy()
+    told[~seen] = _spreads_levels(problem, fitted.x, active.global_index[asked][~seen])
+    if not told.all():
         found.append(
-            f"the data tell nothing about {_listed([o for o, s in zip(owners, seen, strict=True) if not s])}"
+            f"the data tell nothing about {_listed([o for o, s in zip(owners, told, strict=True) if not s])}"
         )
     information = np.einsum("cmi,cmj->ij", columns, reduced)[np.ix_(seen, seen)]
     size = np.sqrt(total[seen])
@@ -130,6 +136,16 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
             f"the data determine only a combination of {_listed(absorbed)}; their priors tell the rest"
         )
     return found
+
+
+def _spreads_levels(problem: Problem, x: np.ndarray, index: np.ndarray) -> np.ndarray:
+    """Which coordinates act on what clusters have of their own, as a spread of levels does: these tell of them."""
+    before, found = problem.compiled.evaluate(x)[2], []
+    for i in index:
+        moved = x.copy()
+        moved[i] += _STEP
+        found.append(bool((problem.compiled.evaluate(moved)[2] != before).any()))
+    return np.array(found, bool)
 
 
 def _listed(names: Sequence[str]) -> str:

@@ -1,7 +1,8 @@
-"""States that clusters share, about as many as there are data, as of one long series: found together, and integrated out.
+"""States and levels that clusters share, found together and integrated out.
 
-The mode of such states and of what they all share at once lets the noise vanish. Integrated out by Laplace's method they
-add V = -1/2 log |H| to the log density, H their curvature, of which each cluster is given the same part.
+The mode of levels and of their spread at once makes the spread too large, as levels in units of it shrink; with states
+for about every reading of a series the noise vanishes. Integrated out by Laplace's method they add V = -1/2 log |H| to the
+log density, H their curvature, of which each cluster is given the same part.
 """
 
 from __future__ import annotations
@@ -26,13 +27,18 @@ _NORMAL: Final = ("Normal", "MultivariateNormal", "GaussianRandomWalk")
 
 
 def states(problem: Problem) -> Active:
-    """The states of the base model as the only free coordinates; none where there are few for the data."""
-    active = activate(problem)
+    """The states of the base model as the only free coordinates.
+
+    These are what is drawn in units of an unknown spread, and where there is about one for every reading whatever is large.
+    """
+    active, sites = activate(problem), problem.declaration.sites
     shared = [b for b in active.blocks if not b.local]
-    sites = problem.declaration.sites
-    large = [b for b in shared if b.size >= _LARGE and sites[b.name].distribution in _NORMAL]
     many = sum(b.size for b in shared) >= _MANY * problem.n_observation
-    return replace(active, blocks=tuple(large) if many else ())
+    chosen = (
+        b.name in problem.decentred or (many and b.size >= _LARGE and sites[b.name].distribution in _NORMAL)
+        for b in shared
+    )
+    return replace(active, blocks=tuple(b for b, is_state in zip(shared, chosen, strict=True) if is_state))
 
 
 def held(problem: Problem) -> Int[np.ndarray, " shared"]:

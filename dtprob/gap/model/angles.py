@@ -60,7 +60,9 @@ def unrolled(model: Model, data: Data) -> Model:
         }
         uniform = {n: fn for n, fn in own.items() if type(fn) is dist.Uniform}
         names.extend(uniform)
-        return {n: jnp.abs(jnp.asarray(fn.high) - jnp.asarray(fn.low) - _TURN).max() for n, fn in uniform.items()}
+        return {
+            n: jnp.abs(jnp.asarray(fn.high) - jnp.asarray(fn.low) - _TURN).max() for n, fn in uniform.items()
+        }
 
     key = jax.random.key(0)
     jax.eval_shape(found, arrays, key)

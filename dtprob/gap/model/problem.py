@@ -72,8 +72,10 @@ class Problem:
             cluster if cluster is not None and cluster in data and np.ndim(data[cluster]) == 1 else None
         )
         self._cluster = None if self.column else cluster
-        model = unrolled(model, data)
         self._declare(model, static)
+        model = unrolled(model, data)
+        if model is not self.model:
+            self._declare(model, static)
         self._check_effects()
         self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
         self.per_cluster: frozenset[str] = frozenset()
@@ -84,9 +86,11 @@ class Problem:
         self._lay_out()
         shared = self.declaration.latent.keys() - self.own.keys()
         drawn = model if reference is not None else decentred(model, data, shared)
+        latent = set(self.declaration.latent)
         if drawn is not model:
             self._declare(drawn, static)
             self.set_live(())
+        self.decentred: frozenset[str] = frozenset(self.declaration.latent.keys() - latent)
         self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
             self.known = normal_of(self._reference_draws(reference))

@@ -22,6 +22,8 @@ _FINEST: Final = 512
 """Half waves of the finest ripple that is looked for."""
 _CROSSED: Final = 3
 """Half waves along each of two columns of what varies over both."""
+_SHARES: Final = 16
+"""Parts of a column between whose values steps are looked for."""
 _MOST_PAIRS: Final = 6
 _LONGEST: Final = 24
 """Period of the longest cycle that is looked for; longer ones show as ripples."""
@@ -200,8 +202,9 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
 
 
 def _over(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
-    """Smooth over a column (size,), and ripples over its values."""
+    """Smooth over a column (size,), beyond one of its values, and ripples over them."""
     yield Curves(f"along {name}", _smooth(column))
+    yield Curves(f"beyond a value of {name}", _steps(column))
     yield from _ripples(name, (column - column.min()) / np.ptp(column), finest)
 
 
@@ -232,6 +235,12 @@ def _smooth(column: np.ndarray) -> np.ndarray:
     """
     line = (column - column.mean()) / (2**0.5 * column.std())
     return np.concatenate([_waves(_rank(column), 1, _ORDER), line[None], np.full_like(line, 0.5**0.5)[None]])
+
+
+def _steps(column: np.ndarray) -> np.ndarray:
+    """Steps at values that part the ranks into equal shares (step, size)."""
+    cuts = np.unique(np.quantile(column, np.arange(1, _SHARES) / _SHARES))
+    return np.where(column > cuts[:, None], 0.5, -0.5)
 
 
 def _rank(column: np.ndarray) -> np.ndarray:
