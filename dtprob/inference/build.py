@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -11,13 +10,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
-from numpyro.distributions import biject_to, constraints
 
 from dtprob.errors import InputError
 from dtprob.inference.circular import mean_direction
 from dtprob.inference.target import Coordinates, Inputs, Target, free_value
-from dtprob.models.arguments import Data, Model, model_name, split_static
-from dtprob.models.declaration import base_constraint, declare, trace_model
+from dtprob.models.arguments import Data, Model, split_static
+from dtprob.models.declaration import declare, trace_model
+from dtprob.models.supported import refuse_unsupported
 
 _NORMAL_IQR = 1.349
 _KEPT_TARGETS = 32
@@ -108,41 +107,9 @@ def _unconstrained_shapes(
     def run(traced: dict[str, Any], key: Array) -> None:
         trace = trace_model(model, eqx.combine(traced, static), key)
         for name, message in trace.items():
-            _refuse_message(model, name, message)
+            refuse_unsupported(model, name, message)
             if message["type"] == "sample" and not message["is_observed"]:
                 shapes[name] = tuple(jnp.shape(free_value(message)))
 
     jax.eval_shape(run, arrays, jax.random.key(0))
     return shapes
-
-
-def _refuse_message(model: Model, name: str, message: Mapping[str, Any]) -> None:
-    what = f"model {model_name(model)}"
-    if message["type"] == "param":
-        remedy = "Declare it with numpyro.sample and a prior"
-        raise InputError(what, "latent sites with priors", f"the parameter site {name!r}", remedy)
-    if message["type"] == "plate":
-        size, subsample = message["args"]
-        if subsample is not None and subsample != size:
-            got = f"plate {name!r} that takes {subsample} of {size}"
-            raise InputError(what, "plates without subsampling", got, "Give the plate its full size")
-    if message["type"] == "sample" and not message["is_observed"]:
-        _refuse_latent(what, name, message["fn"])
-
-
-def _refuse_latent(what: str, name: str, fn: Any) -> None:
-    support = base_constraint(fn.support)
-    kind = f"{name!r} ({type(fn).__name__})"
-    if support is None or support.is_discrete:
-        remedy = "Sum it out in the model (numpyro.factor), since the density must have a gradient"
-        raise InputError(what, "continuous latent sites", f"the discrete latent site {kind}", remedy)
-    if support is constraints.complex:
-        remedy = "Sample its real and imaginary parts as two sites"
-        raise InputError(what, "real latent sites", f"the complex latent site {kind}", remedy)
-    if support is not constraints.circular:
-        try:
-            biject_to(fn.support)
-        except NotImplementedError:
-            remedy = "Sample a real or positive site and compute it from that"
-            got = f"the latent site {kind}"
-            raise InputError(what, "supports that NumPyro maps to the reals", got, remedy) from None

@@ -36,6 +36,7 @@ from dtprob.gap.observation import whiten
 from dtprob.inference.posterior import Sampler
 from dtprob.models.arguments import Data, Model, as_arrays, split_static
 from dtprob.models.declaration import Declaration, declare
+from dtprob.models.supported import check_supported
 
 _REFERENCE_DRAWS = 1000
 _MIDDLE = 2.563
@@ -73,6 +74,7 @@ class Problem:
         )
         self._cluster = None if self.column else cluster
         self._declare(model, static)
+        check_supported(model, data)
         model = unrolled(model, data)
         if model is not self.model:
             self._declare(model, static)

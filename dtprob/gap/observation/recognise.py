@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Final, NamedTuple
 
 import jax
@@ -89,7 +89,7 @@ def _plain(fn: Any) -> _Found | None:
 
 def _compound(fn: Any, value: Any) -> _Found | None:
     """One that is made of another."""
-    if isinstance(fn, dist.MixtureSameFamily):
+    if isinstance(fn, (dist.MixtureSameFamily, dist.MixtureGeneral)):
         return _mixed(fn)
     if isinstance(fn, dist.ZeroInflatedProbs):
         found = _plain(unwrapped(fn.base_dist)[0])
@@ -106,13 +106,30 @@ def _compound(fn: Any, value: Any) -> _Found | None:
     return None
 
 
-def _mixed(fn: Any) -> _Found | None:
-    chance = fn.mixing_distribution.probs
-    found = _of("Mixture", fn.component_distribution, {"log_weight": jnp.log(chance)})
-    if found is None:
+def _mixed(fn: dist.MixtureSameFamily | dist.MixtureGeneral) -> _Found | None:
+    """Parts along a last axis, each with its chance."""
+    listed = isinstance(fn, dist.MixtureGeneral)
+    parts = _stacked(fn.component_distributions) if listed else _of("Mixture", fn.component_distribution, {})
+    if parts is None:
         return None
-    shapes = {n: jnp.broadcast_shapes(jnp.shape(v), chance.shape[-1:]) for n, v in found.parameters.items()}
-    return _Found(found.family, {n: jnp.broadcast_to(v, shapes[n]) for n, v in found.parameters.items()})
+    chance = jnp.asarray(fn.mixing_distribution.probs)
+    given = {**parts.parameters, "log_weight": jnp.log(chance)}
+    shapes = {n: jnp.broadcast_shapes(jnp.shape(v), chance.shape[-1:]) for n, v in given.items()}
+    return _Found(parts.family, {n: jnp.broadcast_to(v, shapes[n]) for n, v in given.items()})
+
+
+def _stacked(parts: Sequence[Any]) -> _Found | None:
+    """Parts of one family along a last axis; None where they are of several."""
+    found = [_of("Mixture", part, {}) for part in parts]
+    first = found[0]
+    if first is None or any(one is None or one.family != first.family for one in found):
+        return None
+    every = {n: [one.parameters[n] for one in found if one is not None] for n in first.parameters}
+    wide = {n: jnp.broadcast_shapes(*map(jnp.shape, values)) for n, values in every.items()}
+    return _Found(
+        first.family,
+        {n: jnp.stack([jnp.broadcast_to(v, wide[n]) for v in values], -1) for n, values in every.items()},
+    )
 
 
 def _of(kind: str, base: Any, further: Mapping[str, Any]) -> _Found | None:

@@ -136,3 +136,14 @@ def test_values_of_another_shape_than_the_distribution_are_refused():
     for wrong in (jnp.ones((5, 1)), jnp.ones(4)):
         with pytest.raises(InputError, match=r"observed site 'y': expected values of shape \(5,\)"):
             declare(outside, {**data, "y": wrong})
+
+
+def test_what_jax_cannot_trace_is_told_in_one_line():
+    def branching(distance, y=None):
+        slope = numpyro.sample("slope", dist.Normal())
+        mean = slope * distance if distance.mean() > 0 else distance
+        with numpyro.plate("place", len(distance)):
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+    with pytest.raises(InputError, match=r"model branching: expected operations .* jnp.where"):
+        declare(branching, {"distance": jnp.ones(5), "y": jnp.ones(5)})

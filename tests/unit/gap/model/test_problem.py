@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 import numpyro.distributions as dist
 import pytest
 from numpyro.infer.util import log_density, potential_energy
@@ -249,3 +250,35 @@ def test_an_effect_that_looks_at_its_own_site_is_refused_before_anything_is_fitt
     problem = Problem(line, draw("line"), [greedy])
     with pytest.raises(InputError, match=r"effect greedy.*its own site, which is its first argument"):
         _ = problem.float_sites
+
+
+def with_parameter(x, y=None):
+    level = numpyro.param("level", 0.0) + numpyro.sample("offset", dist.Normal())
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+
+def with_class(x, y=None):
+    level = numpyro.sample("class", dist.Bernoulli(0.5)) + numpyro.sample("offset", dist.Normal())
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+
+def with_part(x, y):
+    level = numpyro.sample("offset", dist.Normal())
+    with numpyro.plate("row", len(x), subsample_size=3) as rows:
+        numpyro.sample("y", dist.Normal(level, 1.0), obs=y[rows])
+
+
+@pytest.mark.parametrize(
+    ("model", "what"),
+    [
+        (with_parameter, "parameter site 'level'"),
+        (with_class, "discrete latent site 'class'"),
+        (with_part, "3 of 8"),
+    ],
+    ids=lambda value: getattr(value, "__name__", None),
+)
+def test_models_without_a_density_of_all_are_refused(model, what):
+    with pytest.raises(InputError, match=what):
+        Problem(model, {"x": np.ones(8), "y": np.ones(8)}, ())

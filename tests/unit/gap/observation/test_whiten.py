@@ -410,6 +410,20 @@ def test_parts_of_a_mixture_that_share_a_scale():
     )
 
 
+def test_mixtures_of_a_list_of_parts():
+    weights = dist.Categorical(probs=jnp.array([0.3, 0.7]))
+    parts = [dist.Normal(jnp.arange(4.0), 1.0), dist.Normal(-3.0, jnp.full(4, 2.0))]
+    fn = dist.MixtureGeneral(weights, parts, support=dist.constraints.real)
+    observed = whiten.observation(fn, jnp.arange(4.0), "y")
+    assert observed.family == "Mixture Normal"
+    np.testing.assert_allclose(
+        whiten.log_prob(observed, jnp.arange(4.0)), fn.log_prob(jnp.arange(4.0)), rtol=1e-6
+    )
+    unlike = dist.MixtureGeneral(weights, [parts[0], dist.StudentT(3.0)], support=dist.constraints.real)
+    with pytest.raises(InputError, match="MixtureGeneral"):
+        whiten.observation(unlike, jnp.arange(4.0), "y")
+
+
 def test_information_on_the_spread_of_counts():
     """Against the sum over all counts."""
     mean, concentration = (a.ravel() for a in np.meshgrid([0.05, 3.0, 400.0, 3e5], [0.3, 5.0, 200.0]))

@@ -1,0 +1,66 @@
+"""What a model may not hold: unknowns without a prior, or without a density that has a gradient."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import equinox as eqx
+import jax
+from numpyro.distributions import biject_to, constraints
+
+from dtprob.errors import InputError
+from dtprob.models.arguments import Data, Model, model_name, split_static
+from dtprob.models.declaration import base_constraint, trace_model
+
+
+def check_supported(model: Model, data: Data) -> None:
+    """Look at all that a model samples.
+
+    Raises:
+        InputError: there is something that has no density with a gradient.
+    """
+    arrays, static = split_static(data)
+
+    def run(arrays: Any, key: jax.Array) -> None:
+        for name, message in trace_model(model, eqx.combine(arrays, static), key).items():
+            refuse_unsupported(model, name, message)
+
+    jax.eval_shape(run, arrays, jax.random.key(0))
+
+
+def refuse_unsupported(model: Model, name: str, message: Mapping[str, Any]) -> None:
+    """Look at one message of a model's trace.
+
+    Raises:
+        InputError: it is a parameter, a plate that subsamples, or a latent site that is discrete or complex.
+    """
+    what = f"model {model_name(model)}"
+    if message["type"] == "param":
+        remedy = "Declare it with numpyro.sample and a prior"
+        raise InputError(what, "latent sites with priors", f"the parameter site {name!r}", remedy)
+    if message["type"] == "plate":
+        size, subsample = message["args"]
+        if subsample is not None and subsample != size:
+            got = f"plate {name!r} that takes {subsample} of {size}"
+            raise InputError(what, "plates without subsampling", got, "Give the plate its full size")
+    if message["type"] == "sample" and not message["is_observed"]:
+        _refuse_latent(what, name, message["fn"])
+
+
+def _refuse_latent(what: str, name: str, fn: Any) -> None:
+    support = base_constraint(fn.support)
+    kind = f"{name!r} ({type(fn).__name__})"
+    if support is None or support.is_discrete:
+        remedy = "Sum it out in the model (numpyro.factor), since the density must have a gradient"
+        raise InputError(what, "continuous latent sites", f"the discrete latent site {kind}", remedy)
+    if support is constraints.complex:
+        remedy = "Sample its real and imaginary parts as two sites"
+        raise InputError(what, "real latent sites", f"the complex latent site {kind}", remedy)
+    if support is not constraints.circular:
+        try:
+            biject_to(fn.support)
+        except NotImplementedError:
+            remedy = "Sample a real or positive site and compute it from that"
+            got = f"the latent site {kind}"
+            raise InputError(what, "supports that NumPyro maps to the reals", got, remedy) from None
