@@ -287,8 +287,8 @@ def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
     """1 - posterior variance / prior variance of each global nuisance, in unconstrained coordinates."""
     problem, fitted = evidence.problem, evidence.base
     deviation = problem.prior_middle[1].copy()
-    for name, (_, precision) in problem.known.items():
-        deviation[problem.layout[name].index.reshape(-1)] = np.sqrt(np.diag(np.linalg.inv(precision)))
+    for names, (_, precision) in problem.known.items():
+        deviation[problem.layout.indices(names)] = np.sqrt(np.diag(np.linalg.inv(precision)))
     change = np.zeros(problem.dimension)
     variance = np.diag(fitted.covariance) / np.maximum(deviation[fitted.global_index], 1e-300) ** 2
     change[fitted.global_index] = np.clip(1 - variance, 0.0, 1.0)

@@ -53,12 +53,21 @@ def _column(name: str, entry: Any) -> Any:
         return array
     if not (is_array or is_column):
         return entry  # a list of words is a setting
-    raise InputError(
-        f"data {name!r}",
-        "numbers",
-        f"values such as {str(array.reshape(-1)[0])!r}" if array.size else "objects",
-        "Give each word a whole number (the first of pandas.factorize), or leave the column out.",
-    )
+    if not array.size:
+        raise InputError(f"data {name!r}", "at least one value", "none", "Give a row for each reading.")
+    odd = [k for k, value in enumerate(array.reshape(-1)) if not _is_number(value)]
+    got = f"{str(array.reshape(-1)[odd[0]])!r} at index {odd[0]}" if odd else "numbers as text"
+    words = "Give each word a whole number (the first of pandas.factorize), each time seconds, or leave the column out."
+    repair = "Write it as a number, or mask the reading."
+    raise InputError(f"data {name!r}", "numbers", got, words if 2 * len(odd) > array.size else repair)
+
+
+def _is_number(value: Any) -> bool:
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
 
 
 def select_arguments(function: Model, data: Data) -> dict[str, Any]:

@@ -4,24 +4,22 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Mapping
 from typing import Any
 
 import jax.numpy as jnp
-import numpy as np
 import numpyro
 from numpyro import handlers
 
-from dtprob.gap.model.layout import fold, transform_of
+from dtprob.gap.model.layout import Known, fold, transform_of
 from dtprob.models.arguments import Model
 
 
-def informed(model: Model, known: Mapping[str, tuple[np.ndarray, np.ndarray]]) -> Model:
+def informed(model: Model, known: Known) -> Model:
     """The model with a normal density, in unconstrained coordinates, in place of some sites' priors.
 
     Args:
         model: any model.
-        known: mean (n,) and precision (n, n) of the flattened sites that earlier data inform.
+        known: mean and precision of the flattened sites that earlier data inform.
     """
     if not known:
         return model
@@ -30,14 +28,18 @@ def informed(model: Model, known: Mapping[str, tuple[np.ndarray, np.ndarray]]) -
     def replaced(*args: Any, **data: Any) -> Any:
         with handlers.trace() as trace:
             result = model(*args, **data)
-        for name, (mean, precision) in known.items():
-            fn, value = trace[name]["fn"], trace[name]["value"]
-            transform = transform_of(fn)
-            u = transform.inv(value)
-            jacobian = fold(transform.log_abs_det_jacobian(u, value), fn.batch_shape)
-            deviation = u.reshape(-1) - mean
-            prior = jnp.sum(fn.log_prob(value) + jacobian)
-            numpyro.factor(f"{name}_reference", -0.5 * deviation @ (precision @ deviation) - prior)
+        for names, (mean, precision) in known.items():
+            flat, prior = [], jnp.zeros(())
+            for name in names:
+                fn, value = trace[name]["fn"], trace[name]["value"]
+                transform = transform_of(fn)
+                u = transform.inv(value)
+                jacobian = fold(transform.log_abs_det_jacobian(u, value), fn.batch_shape)
+                flat.append(u.reshape(-1))
+                prior = prior + jnp.sum(fn.log_prob(value) + jacobian)
+            deviation = jnp.concatenate(flat) - mean
+            name = f"{'_'.join(names)}_reference"
+            numpyro.factor(name, -0.5 * deviation @ (precision @ deviation) - prior)
         return result
 
     replaced.__signature__ = inspect.signature(model)  # pyright: ignore[reportAttributeAccessIssue]

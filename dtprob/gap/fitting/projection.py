@@ -24,6 +24,10 @@ _TOGETHER: Final = 32
 """Clusters whose projected columns are held at once."""
 _FEWEST_DRAWN: Final = 64
 """Numbers of a replicate that are drawn at least."""
+_HEAVY: Final = ("StudentT", "Cauchy", "Laplace", "Logistic", "SoftLaplace")
+"""Priors with heavier tails than a normal one, drawn about zero."""
+_LEVEL: Final = 1e-6
+"""Slope of a log prior that is none."""
 _ROUNDING: Final = 1e-9
 """What is left of a coordinate after its fit is taken back, as a share of the fit, is zero below this."""
 
@@ -162,6 +166,9 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     slope = prior_slope + effect_slope
     prior_global = hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
     prior_local = np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
+    heavy = _heavy_tailed(problem, active, fitted.x, directions, slope=prior_slope)
+    prior_global = _along_secant(prior_global, heavy[active.global_index])
+    prior_local = _along_secant(prior_local, heavy[active.local_index])
     prior_local = prior_local + effect_curvature[active.local_index][..., None] * np.eye(
         prior_local.shape[-1]
     )
@@ -169,7 +176,7 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     own = _known(slope[active.local_index], prior_local, np.einsum("cml,cml->cl", w_local, w_local))
     inner = np.isin(active.global_index, states(problem).global_index)
     w_global, centre = (
-        _centred_on_states(problem, active, fitted.x, directions, w=w_global, inner=inner, shared=shared)
+        _centred_on_states(problem, active, fitted.x, directions, w=w_global, inner=inner)
         if problem.volume is not None and inner.any()
         else _centred(problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own)
     )
@@ -194,11 +201,10 @@ def _centred_on_states(
     *,
     w: np.ndarray,
     inner: np.ndarray,
-    shared: Known,
 ) -> tuple[np.ndarray, Centred | None]:
     """The same where the global coordinates of a mask are states that are integrated out."""
-    there = x.copy()
-    there[active.global_index] -= np.where(inner, shared.deviation, 0.0)
+    there, at = x.copy(), active.global_index[inner]
+    there[at] = problem.prior_middle[0][at]
     moved = np.asarray(problem.compiled.linearised(there, directions[: len(inner)])[1])
     if not np.isfinite(moved).all():
         return w, None
@@ -234,6 +240,34 @@ def _centred(
         centre = Centred.of(there, w_local, w[..., n:])
         return centre.columns(w_global, w[..., :n]), centre
     return w_global if problem.volume is None else w[..., :n], None
+
+
+def _heavy_tailed(
+    problem: Problem, active: Active, x: np.ndarray, directions: np.ndarray, *, slope: np.ndarray
+) -> np.ndarray:
+    """Precision (dimension,) of heavy-tailed priors about zero, not a number where a prior is of another kind.
+
+    Given its weight, a Student t variable is normal, of the precision that its slope has along the secant to its centre
+    (Lange, Little and Taylor, JASA 84 (1989) 881). The curvature at a far one is no precision: it may be negative.
+    """
+    found, names = np.full(len(x), np.nan), problem.declaration.sites
+    own = [b.index for b in active.blocks if b.owner is None and names[b.name].distribution in _HEAVY]
+    if not own:
+        return found
+    index = np.unique(np.concatenate([i.reshape(-1) for i in own]))
+    centre = x.copy()
+    centre[index] = 0.0
+    level = np.abs(problem.compiled.prior(centre, directions)[0][index]) < _LEVEL
+    away = level & (np.abs(x[index]) > _LEVEL)
+    found[index[away]] = -slope[index[away]] / x[index[away]]
+    return found
+
+
+def _along_secant(precision: np.ndarray, secant: np.ndarray) -> np.ndarray:
+    """Precision (..., i, i) with other entries on its diagonal where these are numbers."""
+    told = np.isfinite(secant)
+    apart = np.where(told[..., :, None] | told[..., None, :], 0.0, precision)
+    return apart + np.where(told, secant, 0.0)[..., None] * np.eye(secant.shape[-1])
 
 
 def _known(slope: np.ndarray, precision: np.ndarray, information: np.ndarray) -> Known:

@@ -30,9 +30,12 @@ def states(problem: Problem) -> Active:
     """The states of the base model as the only free coordinates.
 
     These are what is drawn in units of an unknown spread, and where there is about one for every reading whatever is large.
+    Where clusters have unknowns of their own these are integrated out, and there are no states.
     """
     active, sites = activate(problem), problem.declaration.sites
     shared = [b for b in active.blocks if not b.local]
+    if active.local_index.shape[1]:
+        return replace(active, blocks=())
     many = sum(b.size for b in shared) >= _MANY * problem.n_observation
     chosen = (
         b.name in problem.decentred or (many and b.size >= _LARGE and sites[b.name].distribution in _NORMAL)

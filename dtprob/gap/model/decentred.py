@@ -55,7 +55,7 @@ class _Inside(Messenger):
             msg["args"] = (handlers.reparam(body, config=dict(self._ways)), *rest)
 
 
-def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
+def decentred(model: Model, data: Data, shared: Collection[str], own: Collection[str] = ()) -> Model:
     """The model with levels whose spread is unknown drawn in units of that spread; itself where there are none.
 
     A level `a` becomes a deterministic site, and `a_decentered` the latent one.
@@ -64,13 +64,15 @@ def decentred(model: Model, data: Data, shared: Collection[str]) -> Model:
         model: any model.
         data: its arguments by name.
         shared: names of latent sites without entries for each cluster.
+        own: names of those with entries for each; heavy-tailed ones are drawn about zero, too.
     """
     arrays, static = split_static(data)
     ways: dict[str, Reparam] = {}
 
     def spreads(key: jax.Array, arrays: Any) -> dict[str, jax.Array]:
         trace = trace_model(model, eqx.combine(arrays, static), key)
-        found = {n: _way(trace[n]["fn"]) for n in shared}
+        heavy = [n for n in own if _is_heavy(trace[n]["fn"])]
+        found = {n: _way(trace[n]["fn"]) for n in (*shared, *heavy)}
         ways.update({n: way for n, way in found.items() if way is not None})
         return {n: _spread(innermost(trace[n]["fn"])) for n in ways}
 
@@ -102,6 +104,12 @@ def _way(fn: Any) -> Reparam | None:
     if not isinstance(own.scale, Tracer):
         return None
     return LocScaleReparam(0.0, shape_params=sorted(names - _SCALED))
+
+
+def _is_heavy(fn: Any) -> bool:
+    """Whether a distribution is one of location and scale that is not normal, as that of levels with outliers."""
+    own = innermost(fn)
+    return set(own.arg_constraints) >= _SCALED and not isinstance(own, dist.Normal)
 
 
 def _spread(fn: Any) -> jax.Array:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from itertools import combinations
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -14,6 +15,9 @@ from numpyro.distributions.transforms import IdentityTransform
 
 from dtprob.gap.model.own import Own
 from dtprob.models.declaration import base_constraint
+
+_TOGETHER: Final = 0.25
+"""Correlation of two entries from which their sites are taken together; a thousand draws make .15 of chance."""
 
 
 @dataclass(frozen=True)
@@ -115,11 +119,32 @@ def fold(jacobian: jax.Array, batch_shape: tuple[int, ...]) -> jax.Array:
     return jnp.sum(jacobian, axis=tuple(range(-extra, 0))) if extra > 0 else jacobian
 
 
-def normal_of(draws: Mapping[str, np.ndarray]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Mean and precision of draws (draw, size) of each block."""
-    result = {}
-    for name, u in draws.items():
+type Known = dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]]
+"""Mean and precision of sites together, each flattened, by their names."""
+
+
+def normal_of(draws: Mapping[str, np.ndarray]) -> Known:
+    """Normal approximation of draws (draw, size) of sites; those that go together, as slope and intercept do, are one."""
+    result: Known = {}
+    for names in _groups(draws):
+        u = np.concatenate([draws[name] for name in names], axis=1)
         size = np.mean(u**2, axis=0)
         floor = 1e-10 * np.where(size > 0, size, 1.0)  # in the unit of each entry
-        result[name] = (u.mean(0), np.linalg.inv(np.atleast_2d(np.cov(u.T)) + np.diag(floor)))
+        result[names] = (u.mean(0), np.linalg.inv(np.atleast_2d(np.cov(u.T)) + np.diag(floor)))
     return result
+
+
+def _groups(draws: Mapping[str, np.ndarray]) -> list[tuple[str, ...]]:
+    """Sites joined by correlations that are more than chance makes of so many draws."""
+    names = list(draws)
+    label = {name: k for k, name in enumerate(names)}
+    for one, other in combinations(names, 2):
+        if label[one] != label[other] and _correlation(draws[one], draws[other]) > _TOGETHER:
+            label = {name: label[one] if k == label[other] else k for name, k in label.items()}
+    return [tuple(n for n in names if label[n] == k) for k in sorted(set(label.values()))]
+
+
+def _correlation(one: np.ndarray, other: np.ndarray) -> float:
+    """The largest of any two entries (draw, size)."""
+    scaled = [(u - u.mean(0)) / np.maximum(u.std(0), 1e-300) for u in (one, other)]
+    return float(np.abs(scaled[0].T @ scaled[1]).max(initial=0.0) / len(one))

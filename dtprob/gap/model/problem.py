@@ -23,7 +23,7 @@ from dtprob.gap.model.angles import unrolled
 from dtprob.gap.model.compiled import Compiled
 from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
-from dtprob.gap.model.layout import Block, Layout, make_layout, normal_of, transform_of
+from dtprob.gap.model.layout import Block, Known, Layout, make_layout, normal_of, transform_of
 from dtprob.gap.model.own import Own
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
@@ -79,7 +79,7 @@ class Problem:
         if model is not self.model:
             self._declare(model, static)
         self._check_effects()
-        self.known: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+        self.known: Known = {}
         self.per_cluster: frozenset[str] = frozenset()
         self.volume: Volume | None = None
         self.own: dict[str, Own] = {}
@@ -87,18 +87,23 @@ class Problem:
         self.own = own.of_latents(self)
         self._lay_out()
         shared = self.declaration.latent.keys() - self.own.keys()
-        drawn = model if reference is not None else decentred(model, data, shared)
+        drawn = model if reference is not None else decentred(model, data, shared, self.own)
         latent = set(self.declaration.latent)
         if drawn is not model:
             self._declare(drawn, static)
+            self.own = {}
             self.set_live(())
-        self.decentred: frozenset[str] = frozenset(self.declaration.latent.keys() - latent)
+            self.own = own.of_latents(self)
+            self._lay_out()
+        self.decentred: frozenset[str] = frozenset(self.declaration.latent.keys() - latent - self.own.keys())
         self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
             self.known = normal_of(self._reference_draws(reference))
             self._lay_out()
 
     def _declare(self, model: Model, static: Any) -> None:
+        for name in ("_draw", "prior_middle", "usual"):  # of sites that may have another name now
+            self.__dict__.pop(name, None)
         self.model = model
         self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
         self._declared = Declared(model, self.declaration, static)
@@ -127,7 +132,7 @@ class Problem:
             self._row_shapes,
             self._families,
             self.own,
-            frozenset(self.known),
+            frozenset(name for names in self.known for name in names),
         )
 
     def with_live(self, names: Sequence[str]) -> Problem:

@@ -27,11 +27,11 @@ class Arrays(NamedTuple):
 
     Attributes:
         data: arguments of the model that are arrays, by name.
-        known: mean and precision, unconstrained, of nuisances that earlier data inform instead of the prior.
+        known: mean and precision, unconstrained, of nuisances that earlier data inform instead of the prior, by name.
     """
 
     data: Any
-    known: Mapping[str, tuple[Any, Any]]
+    known: Mapping[tuple[str, ...], tuple[Any, Any]]
 
 
 class Outcome(NamedTuple):
@@ -136,11 +136,11 @@ class Runner:
             parameters[effect.name] = {**unit, **parts}
         return parameters
 
-    def _reference_prior(self, x: Any, known: Mapping[str, tuple[Any, Any]]) -> jax.Array:
+    def _reference_prior(self, x: Any, known: Mapping[tuple[str, ...], tuple[Any, Any]]) -> jax.Array:
         """Log density, up to a constant, of the nuisances that a reference informs."""
         total = jnp.zeros(())
-        for name, (mean, precision) in known.items():
-            d = self.layout.part(x, name).reshape(-1) - mean
+        for names, (mean, precision) in known.items():
+            d = jnp.concatenate([self.layout.part(x, name).reshape(-1) for name in names]) - mean
             total = total - 0.5 * d @ (precision @ d)
         return total
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -17,7 +18,8 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design import Design, Prediction, Ranked, joined, rank, recommend
 from dtprob.gap.observation import whiten
 from dtprob.gap.which.trials import Start
-from dtprob.models.arguments import Data
+from dtprob.models.arguments import Data, as_arrays
+from dtprob.models.declaration import trace_model
 
 _SHOWN: Final = 5
 """Designs that a report lists."""
@@ -103,8 +105,20 @@ def _problem_at(here: Problem, data: Data) -> Problem:
     named = here.cluster_name in data or here.cluster_name in {
         axis for site in here.declaration.observed.values() for axis in site.axes
     }
+    data = _with_values(here, data)
     there = Problem(here.model, data, here.effects, here.cluster_name if named else None)
     return there.with_live([effect.name for effect in here.live])
+
+
+def _with_values(here: Problem, data: Data) -> Data:
+    """Data of what has not been measured yet, with values drawn for what would be observed: nothing looks at them."""
+    sites = {name: site.argument for name, site in here.declaration.observed.items()}
+    missing = {n: a for n, a in sites.items() if a is not None and data.get(a) is None}
+    if not missing:
+        return data
+    given = {**as_arrays(data), **dict.fromkeys(missing.values())}
+    trace = trace_model(here.model, given, jax.random.key(0))
+    return {**given, **{argument: trace[name]["value"] for name, argument in missing.items()}}
 
 
 def _check_parameters(there: Problem, fits: Sequence[Fit], name: str) -> None:

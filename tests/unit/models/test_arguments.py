@@ -55,6 +55,18 @@ def test_settings_stay_what_they_are():
 @pytest.mark.parametrize("words", [np.array(["nokia", "ericsson"]), Column(["nokia", "ericsson"])])
 def test_words_are_refused(words):
     with pytest.raises(
-        InputError, match=r"data 'vendor': expected numbers, got values such as 'nokia'.*factorize"
+        InputError, match=r"data 'vendor': expected numbers, got .nokia. at index 0.*factorize"
     ):
         as_arrays({"vendor": words})
+
+
+def test_one_word_among_numbers_is_shown():
+    with pytest.raises(
+        InputError, match=r"data 'level': expected numbers, got 'n/a' at index 1. Write it as a number"
+    ):
+        as_arrays({"level": np.array(["-91.5", "n/a", "-80.0", "3e1"])})
+
+
+def test_no_rows_at_all():
+    with pytest.raises(InputError, match="at least one value, got none"):
+        as_arrays({"level": Column(np.array([], object))})

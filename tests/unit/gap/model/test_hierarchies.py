@@ -219,3 +219,33 @@ def test_what_all_clusters_share_of_a_series_is_no_gap(kind):
         drifting, of_rooms(kind), [heavy()], cluster="room", engine=Laplace(), key=jax.random.key(0)
     )
     assert found.verdict == "NO_GAP"
+
+
+def outliers(load, hour, room, y=None):
+    """Levels of rooms and of hours, a few far out."""
+    rooms = numpyro.sample("rooms", dist.HalfNormal(8.0))
+    hours = numpyro.sample("hours", dist.HalfNormal(8.0))
+    noise = numpyro.sample("noise", dist.HalfNormal(8.0))
+    with numpyro.plate("room", 20):
+        own = numpyro.deterministic("own", numpyro.sample("level", dist.StudentT(4.0, 0.0, rooms)))
+    with numpyro.plate("hour", 12):
+        shared = numpyro.deterministic("shared", numpyro.sample("beat", dist.StudentT(4.0, 0.0, hours)))
+    mean = numpyro.deterministic("mean", own[room] + shared[hour])
+    with numpyro.plate("row", len(load)):
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+
+@pytest.mark.parametrize("seed", [0, 1])
+def test_levels_with_outliers_are_no_gap(seed):
+    """Far ones are not at the curvature of their prior: both kinds rang alarms of p 1e-8 and less."""
+    rng = np.random.default_rng(seed)
+    room, hour = rng.integers(0, 20, 400), rng.integers(0, 12, 400)
+    levels = 5 * rng.standard_t(4, 20), 2 * rng.standard_t(4, 12)
+    load = rng.uniform(size=400)
+    y = levels[0][room] + levels[1][hour] + 3 * rng.standard_normal(400)
+    data = {"load": load, "hour": hour, "room": room, "y": y}
+    found = diagnose(outliers, data, [heavy()], cluster="room", engine=Laplace(), key=jax.random.key(0))
+    assert found.verdict == "NO_GAP"
+    problem = Problem(outliers, data, [heavy()], cluster="room")
+    assert set(problem.own) == {"level_decentered"}
+    assert problem.decentred == {"beat_decentered"}

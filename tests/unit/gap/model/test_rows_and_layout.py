@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from dtprob.errors import InputError
-from dtprob.gap.model.layout import make_layout
+from dtprob.gap.model.layout import make_layout, normal_of
 from dtprob.gap.model.own import Own
 from dtprob.gap.model.rows import make_rows
 from dtprob.models.declaration import declare
@@ -119,3 +119,21 @@ def test_shared_blocks_move_between_layouts():
     x = np.full(6, -1.0)
     new.copy_into(x, old, np.arange(5.0))
     np.testing.assert_array_equal(x, [2, 3, 4, -1, 0, 1])
+
+
+def test_sites_of_earlier_data_that_go_together_are_one():
+    """An intercept and a slope that are known only together: apart, each would be free to take up a change."""
+    rng = np.random.default_rng(0)
+    slope = rng.standard_normal((1000, 1))
+    draws = {
+        "level": 5 * slope + 0.1 * rng.standard_normal((1000, 1)),
+        "noise": rng.standard_normal((1000, 2)),
+        "slope": slope,
+    }
+    known = normal_of(draws)
+    assert list(known) == [("level", "slope"), ("noise",)]
+    mean, precision = known["level", "slope"]
+    np.testing.assert_allclose(
+        np.linalg.inv(precision), np.cov(np.hstack([draws["level"], slope]).T), rtol=1e-6
+    )
+    np.testing.assert_allclose(mean, [draws["level"].mean(), slope.mean()])

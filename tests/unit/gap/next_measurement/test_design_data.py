@@ -109,6 +109,10 @@ def test_a_diagnosis_recommends_what_splits_its_class():
     found = diagnose(line, before, EFFECTS, designs={"wide": data(wide, 2, 9)}, **options)
     assert found.verdict == "UNDETERMINED"
     plan = found.sections["next_measurement"]
+    places = diagnose(
+        line, before, EFFECTS, designs={"wide": {"x": list(wide)}}, **options
+    )  # not measured yet
+    assert places.sections["next_measurement"]["ranking"] == plan["ranking"]
     assert plan["resolves"]
     assert plan["design"]["design"] == "wide"
     costs = [one["cost"] for one in plan["ranking"] if one["resolves"]]
