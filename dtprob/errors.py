@@ -57,4 +57,5 @@ def unknown_name(what: str, name: str, valid: Iterable[str], kind: str = "name")
     close = nearest(name, names)
     remedy = f"Did you mean '{close}'?" if close else f"Use a valid {kind}"
     shown = ", ".join(names) if len(names) <= 16 else ", ".join(names[:16]) + ", ..."
-    return InputError(what, f"one of the {kind}s {shown}", f"'{name}'", remedy)
+    kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
+    return InputError(what, f"one of the {kinds} {shown}", f"'{name}'", remedy)

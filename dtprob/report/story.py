@@ -203,7 +203,7 @@ def _unlisted(report: Report) -> Story:
         "Cause unknown",
         "unknown",
         "There is a gap, and none of the known effects explains it.",
-        f"The difference between twin and data is real{_seat(report)}, but every effect in the library "
+        f"The difference between twin and data is real{_seat(report)}, but every effect on the list "
         "was tried, and something remains with each.",
         f"Do not add a listed effect: it would hide the problem, not solve it. {look}",
     )

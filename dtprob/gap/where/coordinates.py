@@ -36,8 +36,8 @@ def scan_coordinates(
 ) -> tuple[tuple[CoordinateFinding, ...], dict[str, np.ndarray]]:
     """Energy of the whitened residuals over dyadic blocks of every axis, against its bootstrap distribution.
 
-    Returns the blocks that stand out, family-wise at 1%, and for each axis the energy at its positions in standard
-    deviations, NaN where nothing is observed.
+    Returns the blocks that stand out, family-wise at 1%, and for each axis the energy at its positions as a normal
+    score (squares of few rows are far from normal), NaN where nothing is observed.
     """
     blocks: list[tuple[str, int, int]] = []
     p, excess, maps = [], [], {}
@@ -49,9 +49,8 @@ def scan_coordinates(
         if size < 2:
             continue
         energy = np.stack([_energy(rows, index, size) for rows in drawn.rows])
-        spread = energy[1:].std(0)
-        beyond, nothing = energy[0] - energy[1:].mean(0), np.full(size, np.nan)
-        maps[axis] = np.divide(beyond, spread, out=nothing, where=spread > 0)
+        mean, variance = energy[1:].mean(0), energy[1:].var(0)
+        maps[axis] = np.where(variance > 0, gamma_tail(energy[:1], mean, variance)[1][0], np.nan)
         cumulative = np.concatenate([np.zeros((len(energy), 1)), np.cumsum(energy, axis=1)], axis=1)
         low, high = np.array(list(_windows(size, ordered=axis != problem.declaration.cluster))).T
         inside = cumulative[:, high + 1] - cumulative[:, low]

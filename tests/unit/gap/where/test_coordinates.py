@@ -4,8 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from dtprob.gap.where.coordinates import scan_coordinates
+from dtprob.report.figures import usual_limit
 
 
 def scanned(observed, null, *, outcomes=False):
@@ -25,8 +27,26 @@ def test_a_position_without_observations_has_no_excess():
     observed[:, 2], null[..., 2] = 0.0, 0.0
     excess = scanned(observed, null)[1]["device"]
     assert np.isnan(excess[2])
-    energy = (null[..., 0] ** 2).sum(-1)
-    assert excess[0] == pytest.approx(((observed[:, 0] ** 2).sum() - energy.mean()) / energy.std())
+    energy = (observed[:, 0] ** 2).sum()
+    assert excess[0] == pytest.approx(stats.norm.isf(stats.chi2(50).sf(energy)), abs=0.4)
+
+
+def test_single_readings_of_a_right_twin_stay_where_normal_scores_do():
+    """A square of one reading is 8 standard deviations off once in two hundred."""
+    rng = np.random.default_rng(3)
+    rows = rng.standard_normal((400, 200, 1))
+    position = np.arange(200)[:, None]
+    one = SimpleNamespace(
+        located=np.ones((200, 1)), coordinates={"row": position}, by_cluster=lambda values: values
+    )
+    problem = SimpleNamespace(
+        rows=one, declaration=SimpleNamespace(cluster="row"), families={"heard": "Normal"}
+    )
+    largest = []
+    for k in range(40):
+        drawn = SimpleNamespace(rows=np.concatenate([rows[k : k + 1], rows[40:]]))
+        largest.append(np.abs(scan_coordinates(problem, drawn)[1]["row"]).max())
+    assert np.mean(np.array(largest) > usual_limit(200)) <= 0.2  # 2 of 40 are to be expected, 9 with p 1e-3
 
 
 def test_a_position_that_strays_is_found():
