@@ -128,6 +128,13 @@ def _read_zarr(path: Path) -> Arrays:
 def _read_csv(path: Path) -> Arrays:
     import pandas as pd  # noqa: PLC0415  (slow to import, needed for tables only)
 
+    header = pd.read_csv(path, header=None, nrows=1, dtype=str).iloc[0].tolist()
+    twice = sorted({str(name) for name in header if header.count(name) > 1})
+    if twice:
+        raise InputError(str(path), "columns of different names", f"{twice[0]!r} twice", "Rename one of them")
+    if len(header) == 1 and ";" in str(header[0]):
+        got, remedy = f"one, {header[0]!r}", "Write commas for semicolons, and points in numbers"
+        raise InputError(str(path), "columns that commas separate", got, remedy)
     return _columns(pd.read_csv(path))
 
 

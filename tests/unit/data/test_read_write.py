@@ -337,3 +337,14 @@ def test_bad_files_are_named(tmp_path):
         assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match=r"expected the suffix \.npz or \.nc"):
         write(tmp_path / "a.csv", PowerData(**power_arrays()))
+
+
+@pytest.mark.parametrize(
+    ("text", "what"),
+    [("x,y,x\n1,2,3\n", "columns of different names, got 'x' twice"), ("x;y\n1;2\n", "columns that commas separate")],
+)
+def test_tables_that_would_be_misread_are_refused(tmp_path, text, what):
+    path = tmp_path / "table.csv"
+    path.write_text(text)
+    with pytest.raises(InputError, match=what):
+        read_table(path)
