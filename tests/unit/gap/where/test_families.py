@@ -132,7 +132,9 @@ def test_a_band_of_ripples_is_called_by_its_half_waves(problem):
 
 def test_a_column_of_an_axis_name_stands_for_its_positions(problem):
     place = np.random.default_rng(5).uniform(size=LENGTH)
-    named = SimpleNamespace(declaration=problem.declaration, data={**problem.data, "row": place})
+    named = SimpleNamespace(
+        declaration=problem.declaration, data={**problem.data, "row": place}, responses=problem.responses
+    )
     labels = [c.label for c in curves(named, "row", LENGTH)]
     assert len(labels) == len(set(labels))
     ripple = next(c for c in curves(named, "row", LENGTH) if c.ripple is not None)
@@ -162,10 +164,13 @@ def test_a_quantity_lies_on_the_axes_along_which_it_varies():
 
 def test_curves_over_a_quantity_are_smooth_in_its_rank_and_ripples_over_its_values():
     values = np.random.default_rng(0).lognormal(size=(LENGTH, 3))
-    smooth, *ripples = quantity("delay", ("link", "path"), values).curves()
+    smooth, steps, *ripples = quantity("delay", ("link", "path"), values).curves()
     order = np.argsort(values.reshape(-1))
     assert smooth.label == "along delay"
     assert np.all(np.diff(smooth.values[0][order]) < 0)
+    assert steps.label == "beyond a value of delay"
+    assert np.all(np.diff(steps.values[:, order]) >= 0)
+    np.testing.assert_allclose(steps.values.mean(1), 0.5 - np.arange(1, 16) / 16, atol=1 / values.size)
     scaled = (values.reshape(-1) - values.min()) / np.ptp(values)
     np.testing.assert_allclose(ripples[0].values[1], np.cos(6 * np.pi * scaled), atol=1e-12)
     assert ripples[-1].label.endswith("to 64 half waves")
