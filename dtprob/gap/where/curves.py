@@ -58,12 +58,14 @@ class Curves:
         values: (weight, position).
         ripple: of a band of ripples, what they are along.
         column: of groups of positions, the column of the data that makes them.
+        overlaps: whether they tell the same many times over: their largest score says where, but their sum says nothing.
     """
 
     label: str
     values: np.ndarray | sparse.csr_matrix
     ripple: Ripple | None = None
     column: str | None = None
+    overlaps: bool = False
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -204,7 +206,7 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
 def _over(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     """Smooth over a column (size,), beyond one of its values, and ripples over them."""
     yield Curves(f"along {name}", _smooth(column))
-    yield Curves(f"beyond a value of {name}", _steps(column))
+    yield Curves(f"beyond a value of {name}", _steps(column), overlaps=True)
     yield from _ripples(name, (column - column.min()) / np.ptp(column), finest)
 
 

@@ -8,7 +8,7 @@ from typing import Final
 
 import numpy as np
 
-from dtprob.gap.where.families import Family, Site
+from dtprob.gap.where.families import Family, Pattern, Site
 from dtprob.gap.where.family_test import FamilyTest
 from dtprob.gap.which.fields import common_spread, spread_terms
 
@@ -40,11 +40,18 @@ class Suspect:
 
 def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
     """The families of a site that have the most evidence, ripples also narrowed to the half waves that bring it."""
-    whole = [test for test in tests if test.variance.size <= _MOST_WEIGHTS]
+    whole = [
+        test for test in tests if test.variance.size <= _MOST_WEIGHTS and not _overlaps(test.family.pattern)
+    ]
     choice = float(np.log(max(len(whole), 1)))
     found = [_suspect(site, test, choice) for test in whole]
     found += [_suspect(site, narrow, choice, band) for test in whole for narrow, band in _narrowed(test)]
     return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
+
+
+def _overlaps(pattern: Pattern) -> bool:
+    """Whether the curves of a pattern tell the same many times over, so that their evidence would be, too."""
+    return pattern.curves is not None and pattern.curves.overlaps
 
 
 def _narrowed(test: FamilyTest) -> Iterator[tuple[FamilyTest, float]]:
