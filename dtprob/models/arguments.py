@@ -5,6 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
 from typing import Any, Final, cast
 
 import equinox as eqx
@@ -26,6 +27,18 @@ def model_name(function: Model) -> str:
     while isinstance(function, functools.partial):
         function = function.func
     return getattr(function, "__name__", type(function).__name__)
+
+
+def within(model: Model, handler: Callable[[], AbstractContextManager[Any]]) -> Model:
+    """The model, of the same arguments, each run of it under a handler of its own."""
+
+    @functools.wraps(model)
+    def run(*args: Any, **given: Any) -> Any:
+        with handler():
+            return model(*args, **given)
+
+    run.__signature__ = inspect.signature(model)  # pyright: ignore[reportAttributeAccessIssue]
+    return run
 
 
 def as_arrays(data: Data) -> dict[str, Any]:

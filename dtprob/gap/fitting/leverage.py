@@ -15,7 +15,7 @@ from jaxtyping import Float
 from dtprob.gap.fitting.active import Active, activate, basis, own_basis
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
-from dtprob.gap.fitting.states import states
+from dtprob.gap.fitting.states import are_states
 from dtprob.gap.model.problem import Problem
 
 
@@ -46,7 +46,7 @@ def lost(problem: Problem, fitted: Fit, projection: Projection) -> Float[np.ndar
 
 def _integrated(problem: Problem, active: Active, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
     """Tangents times the covariance (cluster, row, k) of what is integrated out, and its directions (k, dimension)."""
-    inner = np.isin(active.global_index, states(problem).global_index)
+    inner = are_states(problem, active)
     if not inner.any():
         return projection.local_columns @ projection.local_inverse, own_basis(problem, active)
     columns = projection.columns[..., inner]

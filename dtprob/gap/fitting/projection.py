@@ -14,7 +14,7 @@ from dtprob.gap.fitting.active import Active, activate, basis, effect_prior
 from dtprob.gap.fitting.centred import MOST, Centred
 from dtprob.gap.fitting.columns import apart, product, rows_of, rows_of_each, scores
 from dtprob.gap.fitting.newton import positive
-from dtprob.gap.fitting.states import states
+from dtprob.gap.fitting.states import are_states
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
 
@@ -174,7 +174,7 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     )
     shared = _known(slope[active.global_index], prior_global, np.einsum("cmg,cmg->g", w_global, w_global))
     own = _known(slope[active.local_index], prior_local, np.einsum("cml,cml->cl", w_local, w_local))
-    inner = np.isin(active.global_index, states(problem).global_index)
+    inner = are_states(problem, active)
     w_global, centre = (
         _centred_on_states(problem, active, fitted.x, directions, w=w_global, inner=inner)
         if problem.volume is not None and inner.any()
@@ -250,8 +250,8 @@ def _heavy_tailed(
     Given its weight, a Student t variable is normal, of the precision that its slope has along the secant to its centre
     (Lange, Little and Taylor, JASA 84 (1989) 881). The curvature at a far one is no precision: it may be negative.
     """
-    found, names = np.full(len(x), np.nan), problem.declaration.sites
-    own = [b.index for b in active.blocks if b.owner is None and names[b.name].distribution in _HEAVY]
+    found, sites = np.full(len(x), np.nan), problem.declaration.sites
+    own = [b.index for b in active.blocks if b.owner is None and sites[b.name].distribution in _HEAVY]
     if not own:
         return found
     index = np.unique(np.concatenate([i.reshape(-1) for i in own]))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import compress
 from typing import Any, Final
 
 import numpy as np
@@ -11,7 +12,7 @@ from dtprob.errors import InputError
 from dtprob.gap.fitting.active import activate, basis
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import project
-from dtprob.gap.fitting.states import states
+from dtprob.gap.fitting.states import are_states
 from dtprob.gap.model.problem import Problem
 
 UNSEEN: Final = "nothing observed depends on it"
@@ -101,9 +102,10 @@ def _misfit(problem: Problem, fitted: Fit) -> list[str]:
 def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
     """Parameters that the data do not determine: too few clusters, no information, or only a combination of them."""
     active = activate(problem, fitted.effects)
-    inner = {b.name for b in states(problem).blocks}
-    blocks = [b for b in active.blocks if not b.local and b.name not in inner]
-    owners = [b.name if b.size == 1 else f"{b.name}[{j}]" for b in blocks for j in range(b.size)]
+    asked = ~are_states(problem, active)
+    blocks = [b for b in active.blocks if not b.local]
+    every = [b.name if b.size == 1 else f"{b.name}[{j}]" for b in blocks for j in range(b.size)]
+    owners = list(compress(every, asked))
     if not owners:
         return []
     found = []
@@ -112,7 +114,6 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
             f"{problem.n_cluster} clusters for {len(owners)} fitted parameters: what is held out tells little of how far"
             " a cause closes the gap"
         )
-    asked = ~np.isin(active.global_index, states(problem).global_index)
     columns = np.asarray(
         problem.compiled.linearised(fitted.x, basis(problem, active)[: len(asked)][asked])[1]
     )

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dtprob.gap.fitting.active import Active, activate
 from dtprob.gap.fitting.density import moved, system_at, value_of
@@ -42,6 +42,11 @@ def states(problem: Problem) -> Active:
         for b in shared
     )
     return replace(active, blocks=tuple(b for b, is_state in zip(shared, chosen, strict=True) if is_state))
+
+
+def are_states(problem: Problem, active: Active) -> Bool[np.ndarray, " shared"]:
+    """Which of the global coordinates of a fit are states."""
+    return np.isin(active.global_index, states(problem).global_index)
 
 
 def held(problem: Problem) -> Int[np.ndarray, " shared"]:

@@ -5,8 +5,6 @@ A phase near an end of `Uniform(-pi, pi)` cannot cross it, and a fit that came f
 
 from __future__ import annotations
 
-import functools
-import inspect
 import math
 from collections.abc import Collection
 from typing import Any, Final
@@ -18,7 +16,7 @@ import numpy as np
 import numpyro.distributions as dist
 from numpyro.primitives import Messenger
 
-from dtprob.models.arguments import Data, Model, split_static
+from dtprob.models.arguments import Data, Model, split_static, within
 from dtprob.models.declaration import innermost, trace_model
 
 _TURN: Final = 2 * math.pi
@@ -73,13 +71,7 @@ def unrolled(model: Model, data: Data) -> Model:
     if not whole:
         return model
 
-    @functools.wraps(model)
-    def drawn(*args: Any, **given: Any) -> Any:
-        with _Round(whole):
-            return model(*args, **given)
-
-    drawn.__signature__ = inspect.signature(model)  # pyright: ignore[reportAttributeAccessIssue]
-    return drawn
+    return within(model, lambda: _Round(whole))
 
 
 def _is_periodic(model: Model, arrays: Any, static: Any, name: str) -> bool:

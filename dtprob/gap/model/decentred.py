@@ -7,8 +7,6 @@ random walks, Gaussian processes and the states of a `scan`.
 
 from __future__ import annotations
 
-import functools
-import inspect
 from collections.abc import Collection, Mapping
 from typing import Any
 
@@ -24,7 +22,7 @@ from numpyro.infer.reparam import LocScaleReparam, Reparam
 from numpyro.primitives import Messenger
 
 from dtprob.effects.changing import is_scan
-from dtprob.models.arguments import Data, Model, split_static
+from dtprob.models.arguments import Data, Model, split_static, within
 from dtprob.models.declaration import base_constraint, innermost, trace_model
 
 _SCALED = {"loc", "scale"}
@@ -84,13 +82,7 @@ def decentred(model: Model, data: Data, shared: Collection[str], own: Collection
     if not ways:
         return model
 
-    @functools.wraps(model)
-    def drawn(*args: Any, **given: Any) -> Any:
-        with _Inside(ways), handlers.reparam(config=ways):
-            return model(*args, **given)
-
-    drawn.__signature__ = inspect.signature(model)  # pyright: ignore[reportAttributeAccessIssue]
-    return drawn
+    return within(within(model, lambda: handlers.reparam(config=ways)), lambda: _Inside(ways))
 
 
 def _way(fn: Any) -> Reparam | None:

@@ -82,19 +82,13 @@ class Problem:
         self.known: Known = {}
         self.per_cluster: frozenset[str] = frozenset()
         self.volume: Volume | None = None
-        self.own: dict[str, Own] = {}
-        self.set_live(())
-        self.own = own.of_latents(self)
-        self._lay_out()
+        self._find_own()
         shared = self.declaration.latent.keys() - self.own.keys()
         drawn = model if reference is not None else decentred(model, data, shared, self.own)
         latent = set(self.declaration.latent)
         if drawn is not model:
             self._declare(drawn, static)
-            self.own = {}
-            self.set_live(())
-            self.own = own.of_latents(self)
-            self._lay_out()
+            self._find_own()
         self.decentred: frozenset[str] = frozenset(self.declaration.latent.keys() - latent - self.own.keys())
         self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
@@ -107,6 +101,13 @@ class Problem:
         self.model = model
         self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
         self._declared = Declared(model, self.declaration, static)
+
+    def _find_own(self) -> None:
+        """Ask the model, in which nothing counts as a cluster's own at first, what is."""
+        self.own: dict[str, Own] = {}
+        self.set_live(())
+        self.own = own.of_latents(self)
+        self._lay_out()
 
     def set_live(self, live: tuple[Effect, ...]) -> None:
         """Index rows and coordinates for a set of live effects; nothing is compiled yet."""

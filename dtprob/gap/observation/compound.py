@@ -16,7 +16,7 @@ import numpyro.distributions as dist
 from dtprob.gap.observation.likelihood import Likelihood, Move
 from dtprob.gap.observation.normal_scores import NORMAL_SCORES, between
 from dtprob.gap.observation.residuals import Parameters
-from dtprob.gap.observation.whitening import Scores, made_of, outer, own_of, whitened
+from dtprob.gap.observation.whitening import Scores, made_of, outer, own_of, shift_of, whitened
 
 _NODES: Final = 96
 """Of each part, since what tells parts apart may change within a fraction of a deviation."""
@@ -48,7 +48,7 @@ def zero_inflated(base: Likelihood, _: str) -> Likelihood:
         return _bordered(within, across, gate)
 
     def change(p: Parameters, t: Parameters) -> jax.Array:
-        return jnp.concatenate([base.shift(own_of(base, p), own_of(base, t)), t["gate"][None]])
+        return jnp.concatenate([shift_of(base)(p, t), t["gate"][None]])
 
     made = made_of(
         base,
@@ -102,7 +102,7 @@ def mixture(base: Likelihood, family: str) -> Likelihood:
         return jax.lax.scan(one, jnp.zeros((*shape[:-1], size, size)), (z, weight))[0]
 
     def change(p: Parameters, t: Parameters) -> jax.Array:
-        moved = jnp.moveaxis(base.shift(own_of(base, p), own_of(base, t)), -1, 1)
+        moved = jnp.moveaxis(shift_of(base)(p, t), -1, 1)
         moved = moved.at[0, 1:].add(-moved[0, 0])
         weights = jnp.moveaxis(t["log_weight"], -1, 0)
         return jnp.concatenate([moved.reshape(-1, *moved.shape[2:]), weights[:-1] - weights[-1]])

@@ -233,9 +233,7 @@ COMPOUNDS: Final[Mapping[str, Callable[[Likelihood, str], Likelihood]]] = {
     "ZeroInflated": compound.zero_inflated,
     "LeftCensored": partial(limited.censored, left=True),
     "RightCensored": partial(limited.censored, left=False),
-    "LeftTruncated": partial(limited.truncated, bounds=("low",)),
-    "RightTruncated": partial(limited.truncated, bounds=("high",)),
-    "TwoSidedTruncated": partial(limited.truncated, bounds=("low", "high")),
+    **{kind: partial(limited.truncated, kind=kind) for kind in limited.TRUNCATED},
     "Mixture": compound.mixture,
 }
 """What is made of another distribution, by the first word of its family, "Mixture Normal"."""

@@ -7,17 +7,18 @@ only seen between bounds it is that distribution's row less its mean between the
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Callable, Mapping
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 from jax.scipy.special import ndtr
 
-from dtprob.gap.observation.likelihood import Likelihood, Rows
+from dtprob.gap.observation.likelihood import Likelihood
 from dtprob.gap.observation.normal_scores import NORMAL_SCORES, NormalScore, between
 from dtprob.gap.observation.residuals import Parameters
-from dtprob.gap.observation.whitening import Scores, made_of, outer, own_of, whitened
+from dtprob.gap.observation.whitening import Scores, made_of, outer, own_of, shift_of, whitened
 
 
 def _moments(
@@ -65,44 +66,40 @@ def censored(base: Likelihood, family: str, *, left: bool) -> Likelihood:
 
     kind = _Floored if left else _Capped
     made = made_of(base, lambda **p: kind(base.make(**own_of(base, p)), p), {"limit": 0, "censored": 0}, mean)
-    change: Rows = lambda p, t: base.shift(own_of(base, p), own_of(base, t))  # noqa: E731
-    return whitened(made, Scores(scores, information, change), base.relocate)
+    return whitened(made, Scores(scores, information, shift_of(base)), base.relocate)
 
 
-class _Floored(dist.LeftCensoredDistribution):
-    """Draws have their floor."""
+def _limited(kind: Any, clip: Callable[[Any, Any], jax.Array]) -> Any:
+    """A class of censored distributions whose draws have their limit."""
 
-    pytree_data_fields = ("limit",)
+    class Limited(kind):
+        """From what is censored, and the parameters."""
 
-    def __init__(self, base_dist: Any, p: Parameters) -> None:
-        self.limit = p["limit"]
-        super().__init__(base_dist, p["censored"] > 0)
+        pytree_data_fields = ("limit",)
 
-    def sample(self, key: jax.Array | None, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        return jnp.maximum(super().sample(key, sample_shape), self.limit)
+        def __init__(self, base_dist: Any, p: Parameters) -> None:
+            self.limit = p["limit"]
+            super().__init__(base_dist, p["censored"] > 0)
 
+        def sample(self, key: jax.Array | None, sample_shape: tuple[int, ...] = ()) -> jax.Array:
+            return clip(super().sample(key, sample_shape), self.limit)
 
-class _Capped(dist.RightCensoredDistribution):
-    """Draws have their ceiling."""
-
-    pytree_data_fields = ("limit",)
-
-    def __init__(self, base_dist: Any, p: Parameters) -> None:
-        self.limit = p["limit"]
-        super().__init__(base_dist, p["censored"] > 0)
-
-    def sample(self, key: jax.Array | None, sample_shape: tuple[int, ...] = ()) -> jax.Array:
-        return jnp.minimum(super().sample(key, sample_shape), self.limit)
+    return Limited
 
 
-def truncated(base: Likelihood, family: str, *, bounds: tuple[str, ...]) -> Likelihood:
+_Floored: Final = _limited(dist.LeftCensoredDistribution, jnp.maximum)
+_Capped: Final = _limited(dist.RightCensoredDistribution, jnp.minimum)
+TRUNCATED: Final[Mapping[str, tuple[Any, tuple[str, ...]]]] = {
+    "LeftTruncated": (dist.LeftTruncatedDistribution, ("low",)),
+    "RightTruncated": (dist.RightTruncatedDistribution, ("high",)),
+    "TwoSidedTruncated": (dist.TwoSidedTruncatedDistribution, ("low", "high")),
+}
+"""Kinds of distributions that are cut off, and the names of their bounds."""
+
+
+def truncated(base: Likelihood, family: str, *, kind: str) -> Likelihood:
     """Values of which only those between bounds, "low", "high" or both, are ever seen."""
-    score = NORMAL_SCORES[family]
-    kinds: dict[tuple[str, ...], Any] = {
-        ("low",): dist.LeftTruncatedDistribution,
-        ("high",): dist.RightTruncatedDistribution,
-        ("low", "high"): dist.TwoSidedTruncatedDistribution,
-    }
+    score, (make, bounds) = NORMAL_SCORES[family], TRUNCATED[kind]
 
     def moments(p: Parameters) -> tuple[jax.Array, jax.Array, jax.Array]:
         own, shape = own_of(base, p), jnp.shape(p[bounds[0]])
@@ -119,9 +116,8 @@ def truncated(base: Likelihood, family: str, *, bounds: tuple[str, ...]) -> Like
 
     made = made_of(
         base,
-        lambda **p: kinds[bounds](base.make(**own_of(base, p)), *(p[n] for n in bounds)),
+        lambda **p: make(base.make(**own_of(base, p)), *(p[n] for n in bounds)),
         dict.fromkeys(bounds, 0),
         lambda p: moments(p)[0],
     )
-    change: Rows = lambda p, t: base.shift(own_of(base, p), own_of(base, t))  # noqa: E731
-    return whitened(made, Scores(scores, information, change), base.relocate)
+    return whitened(made, Scores(scores, information, shift_of(base)), base.relocate)

@@ -11,6 +11,7 @@ import numpyro.distributions as dist
 
 from dtprob.errors import InputError
 from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, SAME, likelihood
+from dtprob.gap.observation.limited import TRUNCATED
 from dtprob.gap.observation.normal_scores import NORMAL_SCORES
 
 _WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
@@ -100,9 +101,9 @@ def _compound(fn: Any, value: Any) -> _Found | None:
         kind = "LeftCensored" if isinstance(fn, dist.LeftCensoredDistribution) else "RightCensored"
         censored = jnp.broadcast_to(fn.censored, jnp.shape(value))
         return _of(kind, fn.base_dist, {"limit": _limits(kind, censored, value), "censored": censored})
-    for kind, bounds in (("Left", ("low",)), ("Right", ("high",)), ("TwoSided", ("low", "high"))):
-        if type(fn) is getattr(dist, f"{kind}TruncatedDistribution"):
-            return _of(f"{kind}Truncated", fn.base_dist, {n: getattr(fn, n) for n in bounds})
+    for kind, (made, bounds) in TRUNCATED.items():
+        if type(fn) is made:
+            return _of(kind, fn.base_dist, {n: getattr(fn, n) for n in bounds})
     return None
 
 

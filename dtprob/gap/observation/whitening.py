@@ -69,6 +69,11 @@ def own_of(base: Likelihood, p: Parameters) -> Parameters:
     return {name: p[name] for name in base.parameters}
 
 
+def shift_of(base: Likelihood) -> Rows:
+    """What a change of the base's parameters, among others, adds to its rows."""
+    return lambda p, change: base.shift(own_of(base, p), own_of(base, change))
+
+
 def outer(one: jax.Array, other: jax.Array) -> jax.Array:
     """Products (*value, i, j) of rows (i, *value) and (j, *value)."""
     return jnp.einsum("i...,j...->...ij", one, other)
