@@ -57,5 +57,11 @@ def unknown_name(what: str, name: str, valid: Iterable[str], kind: str = "name")
     close = nearest(name, names)
     remedy = f"Did you mean '{close}'?" if close else f"Use a valid {kind}"
     shown = ", ".join(names) if len(names) <= 16 else ", ".join(names[:16]) + ", ..."
-    kinds = f"{kind[:-1]}ies" if kind.endswith("y") else f"{kind}s"
-    return InputError(what, f"one of the {kinds} {shown}", f"'{name}'", remedy)
+    return InputError(what, f"one of the {_plural(kind)} {shown}", f"'{name}'", remedy)
+
+
+def _plural(kind: str) -> str:
+    """Several of what ``kind`` names: ``keys``, ``effect families``, ``kinds of traffic``."""
+    noun, of, rest = kind.partition(" of ")
+    several = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2] not in "aeiou" else f"{noun}s"
+    return f"{several}{of}{rest}"

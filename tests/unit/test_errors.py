@@ -24,4 +24,10 @@ def test_unknown_name_asks_or_lists():
     assert str(unknown_name("[engine]", "nut", ["nuts", "laplace"], "engine")) == (
         "[engine]: expected one of the engines laplace, nuts, got 'nut'. Did you mean 'nuts'?"
     )
+    for kind, kinds in [
+        ("key", "keys"),
+        ("effect family", "effect families"),
+        ("kind of traffic", "kinds of traffic"),
+    ]:
+        assert f"one of the {kinds} a," in str(unknown_name("x", "a1", ["a", "b"], kind))
     assert str(unknown_name("x", "q", [f"n{i}" for i in range(100, 130)])).count(",") == 17

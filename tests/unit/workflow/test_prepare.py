@@ -94,7 +94,7 @@ def test_known_effects_are_unknowns_of_the_model_and_no_candidates(folder, need)
         ("object_displacement", "one effect"),
         ("phase_error", "random field"),
         ("blockage[pole]", "anywhere"),
-        ("timing", "effect family"),
+        ("timing", "effect families"),
     ],
 )
 def test_what_cannot_be_known_is_refused(folder, name, got):
