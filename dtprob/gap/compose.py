@@ -85,7 +85,12 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
             tail = f" It shows at {sites}." if sites else ""
             verb = "imitate" if best is not None and len(best.effects) > 1 else "imitates"
             part = f" {name} {verb} part of it." if name else ""
-            return f"There is a gap, and none of the known effects explains it.{tail}{part}"
+            why = (
+                ", and none of the known effects explains it"
+                if evidence.problem.effects
+                else "; no effects were given that could explain it"
+            )
+            return f"There is a gap{why}.{tail}{part}"
         case _:
             if best is None:
                 return "There are signs of a gap, but the data cannot tell which effect causes it."

@@ -40,7 +40,7 @@ _DEFAULT = Settings()
 def diagnose(
     model: Model,
     data: Data,
-    effects: Sequence[Effect],
+    effects: Sequence[Effect] = (),
     *,
     key: jax.Array,
     engine: AbstractEngine,
@@ -55,7 +55,8 @@ def diagnose(
     Args:
         model: the base model, any NumPyro function with named deterministic sites.
         data: its arguments by name.
-        effects: the candidates; those that name a site the model lacks are an error.
+        effects: the candidates; those that name a site the model lacks are an error. Without any, the diagnosis tells
+            whether and where there is a gap.
         key: typed JAX key; the verdict does not depend on it beyond the declared error rates.
         engine: the engine that confirms the accepted causes and gives their sizes.
         cluster: axis or data column whose values are independent of one another; by default the model's own.
@@ -67,13 +68,9 @@ def diagnose(
         say: receives one line at each stage, for progress.
 
     Raises:
-        InputError: no effects, effects on absent sites, effects that change the model at their null, fewer than four
+        InputError: effects on absent sites, effects that change the model at their null, fewer than four
             clusters, as many unknowns that clusters share as there are data, or a base model that does not fit.
     """
-    if not effects:
-        raise InputError(
-            "effects", "at least one candidate", "none", "Pass effects that act on the model's sites."
-        )
     problem = Problem(model, data, effects, cluster, reference)
     if problem.n_cluster < 4:
         raise InputError(

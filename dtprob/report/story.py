@@ -136,9 +136,7 @@ def _codes(report: Report) -> set[str]:
 def _no_gap(report: Report) -> Story:
     screened = report.get("screening", [])
     untold = sum(bool(row.get("absorbed_by")) for row in screened)
-    tried = (
-        f"{len(screened) - untold} known effects were tried" if screened else "The known effects were tried"
-    )
+    tried = f"{len(screened) - untold} known effects were tried; none of them is needed to explain these data, and"
     beside = (
         f" {untold} more could not be judged, because fitted parameters of the twin take up the same change."
         if untold
@@ -148,8 +146,9 @@ def _no_gap(report: Report) -> Story:
         "No gap found",
         "good",
         "Nothing found: the twin agrees with the data.",
-        f"{tried}; none of them is needed to explain these data, and nothing else was left over.{beside} "
-        f"{_seen(report['detectable'])}",
+        f"{tried} nothing else was left over.{beside} {_seen(report['detectable'])}"
+        if screened
+        else "No effects were given to try; the twin's own quantities differ from the data by no more than chance.",
         "Nothing to change in the twin.",
     )
 
@@ -199,12 +198,15 @@ def _unlisted(report: Report) -> Story:
         else "The values that the twin computes show nothing wrong; what it says of its errors does. Look for what "
         f"could {changed(left[:2])}, or declare errors that are so."
     )
+    real = f"The difference between twin and data is real{_seat(report)}"
+    if not report.get("screening"):
+        headline = "There is a gap; no effects were given that could explain it."
+        return Story("Cause unknown", "unknown", headline, f"{real}.", look)
     return Story(
         "Cause unknown",
         "unknown",
         "There is a gap, and none of the known effects explains it.",
-        f"The difference between twin and data is real{_seat(report)}, but every effect on the list "
-        "was tried, and something remains with each.",
+        f"{real}, but every effect on the list was tried, and something remains with each.",
         f"Do not add a listed effect: it would hide the problem, not solve it. {look}",
     )
 

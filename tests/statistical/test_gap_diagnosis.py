@@ -318,9 +318,13 @@ def test_the_report_is_plain_and_the_maps_are_named():
     assert tree["links"].sizes["link"] == 12
 
 
-def test_no_effects_are_refused():
-    with pytest.raises(InputError, match="at least one candidate"):
-        run(line, draw("line"), ())
+def test_without_candidates_it_is_told_whether_and_where_there_is_a_gap():
+    assert run(line, draw("line"), ()).verdict == "NO_GAP"
+    found = run(line, draw("line", seed=10, shift=0.5 * inputs() ** 2), ())
+    assert (found.verdict, found.causes) == ("UNLISTED", ())
+    assert found.summary.startswith(
+        "There is a gap; no effects were given that could explain it. It shows at "
+    )
 
 
 def test_three_clusters_are_refused():

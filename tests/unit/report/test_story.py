@@ -133,6 +133,14 @@ def test_what_cannot_be_judged_is_said_where_nothing_is_found() -> None:
     assert "1 more could not be judged" in tell(report).meaning
 
 
+def test_that_no_effects_were_given_is_said() -> None:
+    nothing: names.Any = {**_report(), "causes": [], "screening": []}
+    assert "No effects were given" in tell({**nothing, "verdict": "NO_GAP"}).meaning
+    told = tell({**_unlisted(), "screening": []})
+    assert "no effects were given" in told.headline
+    assert "listed" not in told.meaning + told.action
+
+
 def _unlisted(*left: names.Site) -> names.Any:
     found = {"p_value": 1e-9, "sites": [site["site"] for site in left], "located": list(left)}
     nothing: names.Site = {"site": "delay", "p_value": 0.9, "share": None, "family": "spread, common"}
