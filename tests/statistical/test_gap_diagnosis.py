@@ -214,6 +214,13 @@ def test_earlier_data_turn_a_change_into_a_gap():
     assert abs(found.causes[0].size[0].mean - 0.6) < 0.25
 
 
+@pytest.mark.parametrize("seed", [41, 43])
+def test_what_a_fit_that_follows_a_change_costs_on_earlier_data_is_part_of_the_gap(seed):
+    found = run(line, draw("line", seed=seed, shift=0.7 * SIGMA), (raised(), bend()), reference=Earlier())
+    assert (found.verdict, found.causes[0].effects) == ("LISTED", ("raised",))
+    assert found.causes[0].closed_fraction.low > 0.7  # 0.5 and 0.6 by these data alone
+
+
 def test_sizes_too_are_relative_to_earlier_data():
     plain = Problem(line, draw("line", seed=41, shift=0.6), (raised(),), None, Earlier())
     problem = plain.with_live(["raised"])

@@ -42,7 +42,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         key: for prior draws.
         starts: the centre of the prior and at most this many less one draws from it; fewer where the best agree.
         polished: how many of the fits, the best of each optimum, are freed from local optima; fewer where two of
-            them end in one mode.
+            them end at one height.
 
     Raises:
         InputError: the model has no finite likelihood from any start; what breaks is named.
@@ -65,8 +65,8 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     freed: list[fitting.Fit] = []
     for fitted in found[:polished]:
         freed.append(polish(problem, fitted, freed=freed))
-        if any(_is_same(freed[-1], other) for other in freed[:-1]):
-            break  # two starts that end in one mode
+        if any(abs(freed[-1].log_posterior - other.log_posterior) < _SAME for other in freed[:-1]):
+            break  # two starts that end at one height
     best = max([*freed, *found[polished:]], key=lambda f: f.log_posterior)
     best = settled(problem, followed(problem, best))
     return polish(problem, best, added) if added and not polished else best

@@ -25,7 +25,8 @@ class HeldOut:
     """Cross-fitted results of a set of effects.
 
     Attributes:
-        log_likelihood: held-out log marginal likelihood of each cluster (cluster,).
+        log_likelihood: held-out log marginal likelihood of each cluster (cluster,), with its part of what the fits cost
+            on earlier data.
         misses: by how much predictions miss each cluster, by observed site and measure.
         estimates: the effects' parameters in each fold, {site name: (fold, *shape flattened)}.
     """
@@ -77,13 +78,21 @@ def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
     log_likelihood, missed = np.zeros(problem.n_cluster), dict[str, Miss]()
     estimates: dict[str, list[np.ndarray]] = {}
     for held, part in folds:
-        log_likelihood[held] = marginal(problem, part)[held]
+        log_likelihood[held] = (marginal(problem, part) + _on_earlier_data(problem, part))[held]
         for name, miss in problem.compiled.misses(part.x).items():
             before = missed.get(name, Miss(0.0, 0.0, 0.0))
             missed[name] = Miss(*(b + np.where(held, m, 0.0) for b, m in zip(before, miss, strict=True)))
         for block in (b for name in part.effects for b in problem.blocks_of(name) if not b.local):
             estimates.setdefault(block.name, []).append(part.x[block.index[0]])
     return HeldOut(log_likelihood, missed, {n: np.stack(v) for n, v in estimates.items()})
+
+
+def _on_earlier_data(problem: Problem, fitted: fitting.Fit) -> float:
+    """Log density of earlier data at a fit, up to a constant, in equal parts for all clusters; 0 where there are none.
+
+    A fit that gives up what earlier data say in order to follow these does worse on those.
+    """
+    return float(problem.compiled.evaluate(fitted.x).prior) / problem.n_cluster if problem.known else 0.0
 
 
 @dataclass(frozen=True)
