@@ -33,6 +33,7 @@ from dtprob.gap.which.trials import Say, credit
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Data, Model
+from dtprob.models.indices import check_indices
 
 _DEFAULT = Settings()
 
@@ -69,8 +70,10 @@ def diagnose(
 
     Raises:
         InputError: effects on absent sites, effects that change the model at their null, fewer than four
-            clusters, as many unknowns that clusters share as there are data, or a base model that does not fit.
+            clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end, or a
+            base model that does not fit.
     """
+    check_indices(model, data)
     problem = Problem(model, data, effects, cluster, reference)
     if problem.n_cluster < 4:
         raise InputError(

@@ -22,7 +22,8 @@ from dtprob.inference.posterior import Posterior
 from dtprob.inference.smc import SMC
 from dtprob.inference.svi import SVI
 from dtprob.inference.von_mises_em import VonMisesEM
-from dtprob.models.arguments import Model
+from dtprob.models.arguments import Model, select_arguments
+from dtprob.models.indices import check_indices
 
 ENGINES: Mapping[str, type[AbstractEngine]] = {
     engine.name: engine
@@ -90,6 +91,8 @@ def fit(
         settings: the engine's own, such as `draws`.
 
     Raises:
-        InputError: see `resolve` and `AbstractEngine`.
+        InputError: see `resolve` and `AbstractEngine`; or an index in data beyond an array's end.
     """
-    return resolve(engine, **settings)(key, model, data, options=options)
+    used = resolve(engine, **settings)
+    check_indices(model, select_arguments(model, data))
+    return used(key, model, data, options=options)

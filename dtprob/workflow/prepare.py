@@ -21,6 +21,7 @@ from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
 from dtprob.models.arguments import Model
 from dtprob.models.declaration import declare
+from dtprob.models.indices import check_indices
 from dtprob.usercode import load_object
 from dtprob.workflow.models import MODELS
 from dtprob.workflow.scene import reached
@@ -186,7 +187,10 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
         arguments |= {name: jnp.asarray(v) for name, v in MODELS[case.model.name].derive(arguments).items()}
         arguments |= MODELS[case.model.name].reduced({**columns, **arguments})
     own = [] if arrange is None else list(inspect.signature(arrange).parameters)[1:]
-    return arguments | _options(case, takes, arguments, own)
+    arguments |= _options(case, takes, arguments, own)
+    if case.model.name not in MODELS:
+        check_indices(model, arguments, f"{file.name}, column")
+    return arguments
 
 
 def _phase(case: Case, data: Data, *, takes: bool) -> dict[str, Any]:
