@@ -34,7 +34,9 @@ def check_indices(model: Model, data: Data, where: str = "data") -> None:
     if not whole:
         return
 
-    def run(arrays: Mapping[str, Any], key: jax.Array) -> None:  # of which nothing but the indices is compiled
+    def run(
+        arrays: Mapping[str, Any], key: jax.Array
+    ) -> None:  # of which nothing but the indices is compiled
         trace_model(model, eqx.combine(arrays, static), key)
 
     checked = checkify.checkify(run, errors=checkify.index_checks)
@@ -54,4 +56,9 @@ def check_indices(model: Model, data: Data, where: str = "data") -> None:
 
 
 def _is_of_whole_numbers(column: Any) -> bool:
-    return eqx.is_array_like(column) and np.ndim(column) > 0 and np.size(column) > 0 and column.dtype.kind in "iu"
+    return (
+        eqx.is_array_like(column)
+        and np.ndim(column) > 0
+        and np.size(column) > 0
+        and column.dtype.kind in "iu"
+    )

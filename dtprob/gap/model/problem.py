@@ -23,8 +23,9 @@ from dtprob.gap.model.angles import unrolled
 from dtprob.gap.model.compiled import Compiled
 from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
-from dtprob.gap.model.layout import Block, Known, Layout, make_layout, normal_of, transform_of
+from dtprob.gap.model.layout import Block, Known, Layout, make_layout, normal_of
 from dtprob.gap.model.own import Own
+from dtprob.gap.model.prior import Prior
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.model.responses import responses
@@ -92,15 +93,18 @@ class Problem:
         self.decentred: frozenset[str] = frozenset(self.declaration.latent.keys() - latent - self.own.keys())
         self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
-            self.known = normal_of(self._reference_draws(reference))
+            shared = [b.name for b in self.blocks_of(None) if not b.local]
+            draws = self._prior.reference_draws(reference, shared, _REFERENCE_DRAWS, self.arrays)
+            self.known = normal_of(draws)
             self._lay_out()
 
     def _declare(self, model: Model, static: Any) -> None:
-        for name in ("_draw", "prior_middle", "usual"):  # of sites that may have another name now
+        for name in ("prior_middle", "usual"):  # of sites that may have another name now
             self.__dict__.pop(name, None)
         self.model = model
         self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
         self._declared = Declared(model, self.declaration, static)
+        self._prior = Prior(self._declared)
 
     def _find_own(self) -> None:
         """Ask the model, in which nothing counts as a cluster's own at first, what is."""
@@ -140,7 +144,7 @@ class Problem:
         """The same problem with other live effects; what does not depend on them is shared."""
         if set(names) <= {e.name for e in self.live}:
             return self
-        _ = self.programs, self.float_sites, self.field_shapes, self._draw  # made once, then shared
+        _ = self.programs, self.float_sites, self.field_shapes  # made once, then shared
         other = copy(self)
         other.set_live(tuple(e for e in self.effects if e.name in names))
         return other
@@ -165,13 +169,7 @@ class Problem:
 
         Points stay what they are: an effect that no fit holds may still be where its null was before.
         """
-        _ = (
-            self.programs,
-            self.float_sites,
-            self.field_shapes,
-            self._draw,
-            self.compiled,
-        )  # shared: they know no nulls
+        _ = self.programs, self.float_sites, self.field_shapes, self.compiled  # shared: they know no nulls
         other, by_name = copy(self), {e.name: e for e in effects}
         other.effects = tuple(effects)
         other.live = tuple(by_name[e.name] for e in self.live)
@@ -332,36 +330,19 @@ class Problem:
 
     def start(self, values: Mapping[str, Any]) -> np.ndarray:
         """The flat vector at constrained values of all latent sites, live effects at their null."""
-        trace = self._declared.trace(self.arrays, given=values)
-        x = self.null()
-        for name in self.declaration.latent:
-            self.layout.put(x, name, transform_of(trace[name]["fn"]).inv(jnp.asarray(values[name])))
+        x, latent = self.null(), self.declaration.latent
+        for name, value in self._prior.unconstrained({n: values[n] for n in latent}, self.arrays).items():
+            self.layout.put(x, name, value)
         return x
 
     def prior_draws(self, key: jax.Array, n: int) -> np.ndarray:
         """Flat vectors (n, dimension) of prior draws of the latent sites, live effects at their null."""
         x = np.repeat(self.null()[None], n, axis=0)
-        for name, value in self._draw(jax.random.split(key, n), self.arrays).items():
-            if value[0].size:
+        for name, value in self._prior.draws(key, n, self.arrays).items():
+            if value.size:
                 offset = self.layout[name].offset
-                x[:, offset : offset + value[0].size] = np.asarray(value).reshape(n, -1)
+                x[:, offset : offset + value.shape[1]] = value
         return np.where(np.isfinite(x), x, 0.0)
-
-    @cached_property
-    def _draw(self) -> Any:
-        """(keys (n,), arrays) -> unconstrained prior draws (n, ...) of the latent sites, whatever effects are live."""
-
-        @quick_jit
-        def draw(keys: jax.Array, arrays: Any) -> dict[str, Any]:
-            def one(key: jax.Array) -> dict[str, Any]:
-                trace = self._declared.trace(arrays, key)
-                return {
-                    m: transform_of(trace[m]["fn"]).inv(trace[m]["value"]) for m in self.declaration.latent
-                }
-
-            return jax.lax.map(one, keys)
-
-        return draw
 
     @cached_property
     def prior_middle(self) -> tuple[np.ndarray, np.ndarray]:
@@ -383,16 +364,3 @@ class Problem:
         own = [e.site_name(p.name) for e in effects for p in e.parameters]
         parts = {name: self.layout.part(jnp.asarray(x), name) for name in own}
         return {**{name: values[name] for name in self.declaration.latent}, **parts}
-
-    def _reference_draws(self, reference: Sampler) -> dict[str, np.ndarray]:
-        """Unconstrained draws (draw, size) of the global latent sites that a reference knows."""
-        draws = reference.sample(jax.random.key(0), _REFERENCE_DRAWS)
-        names = [b.name for b in self.blocks_of(None) if not b.local and b.name in draws]
-
-        def unconstrain(given: Mapping[str, Any], arrays: Any) -> dict[str, Any]:
-            trace = self._declared.trace(arrays, given=given)
-            return {n: transform_of(trace[n]["fn"]).inv(given[n]).reshape(-1) for n in names}
-
-        chosen = {n: jnp.asarray(draws[n]) for n in names}
-        flat = jax.vmap(unconstrain, in_axes=(0, None))(chosen, self.arrays)
-        return {name: np.asarray(value) for name, value in flat.items()}

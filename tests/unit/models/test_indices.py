@@ -37,7 +37,9 @@ def test_indices_within_an_array_pass(kind):
 
 
 def test_the_column_the_array_and_the_index_are_named():
-    with pytest.raises(InputError, match=r"data 'site': expected indices from 0 to 4 of an array of 5, got 5\."):
+    with pytest.raises(
+        InputError, match=r"data 'site': expected indices from 0 to 4 of an array of 5, got 5\."
+    ):
         check_indices(levels, table(SITES))
 
 
