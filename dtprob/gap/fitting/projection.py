@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from typing import Final, NamedTuple
+from typing import Final
 
 import jax
 import numpy as np
@@ -13,35 +13,18 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import Active, activate, basis, effect_prior
 from dtprob.gap.fitting.centred import MOST, Centred
 from dtprob.gap.fitting.columns import apart, product, rows_of, rows_of_each, scores
+from dtprob.gap.fitting.known import Known, along_secants, known_of, secants
 from dtprob.gap.fitting.newton import positive
 from dtprob.gap.fitting.states import are_states
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
 
-_FAINT: Final = 1e-3
-"""Share of the data's information on a coordinate below which its prior's is not looked at."""
 _TOGETHER: Final = 32
 """Clusters whose projected columns are held at once."""
 _FEWEST_DRAWN: Final = 64
 """Numbers of a replicate that are drawn at least."""
-_HEAVY: Final = ("StudentT", "Cauchy", "Laplace", "Logistic", "SoftLaplace")
-"""Priors with heavier tails than a normal one, drawn about zero."""
-_LEVEL: Final = 1e-6
-"""Slope of a log prior that is none."""
 _ROUNDING: Final = 1e-9
 """What is left of a coordinate after its fit is taken back, as a share of the fit, is zero below this."""
-
-
-class Known(NamedTuple):
-    """What the prior knows of some coordinates, those of which it knows nothing where they are.
-
-    Attributes:
-        deviation: of the fit from the prior's centre (..., coordinate); 0 where the prior knows nothing.
-        root: of the prior's covariance (..., coordinate, coordinate); rows are 0 where it knows nothing.
-    """
-
-    deviation: np.ndarray
-    root: np.ndarray
 
 
 @dataclass(frozen=True)
@@ -166,14 +149,17 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     slope = prior_slope + effect_slope
     prior_global = hessian[:n][:, active.global_index] + np.diag(effect_curvature[active.global_index])
     prior_local = np.moveaxis(hessian[n:][:, active.local_index], 0, 1)
-    heavy = _heavy_tailed(problem, active, fitted.x, directions, slope=prior_slope)
-    prior_global = _along_secant(prior_global, heavy[active.global_index])
-    prior_local = _along_secant(prior_local, heavy[active.local_index])
+    told = np.zeros(problem.dimension)
+    told[active.global_index] = np.einsum("cmg,cmg->g", w_global, w_global)
+    told[active.local_index] = np.einsum("cml,cml->cl", w_local, w_local)
+    secant = secants(problem, active, fitted.x, directions, slope=prior_slope, hessian=hessian, told=told)
+    prior_global = along_secants(prior_global, secant[active.global_index])
+    prior_local = along_secants(prior_local, secant[active.local_index])
     prior_local = prior_local + effect_curvature[active.local_index][..., None] * np.eye(
         prior_local.shape[-1]
     )
-    shared = _known(slope[active.global_index], prior_global, np.einsum("cmg,cmg->g", w_global, w_global))
-    own = _known(slope[active.local_index], prior_local, np.einsum("cml,cml->cl", w_local, w_local))
+    shared = known_of(slope[active.global_index], prior_global, told[active.global_index])
+    own = known_of(slope[active.local_index], prior_local, told[active.local_index])
     inner = are_states(problem, active)
     w_global, centre = (
         _centred_on_states(problem, active, fitted.x, directions, w=w_global, inner=inner)
@@ -240,41 +226,3 @@ def _centred(
         centre = Centred.of(there, w_local, w[..., n:])
         return centre.columns(w_global, w[..., :n]), centre
     return w_global if problem.volume is None else w[..., :n], None
-
-
-def _heavy_tailed(
-    problem: Problem, active: Active, x: np.ndarray, directions: np.ndarray, *, slope: np.ndarray
-) -> np.ndarray:
-    """Precision (dimension,) of heavy-tailed priors about zero, not a number where a prior is of another kind.
-
-    Given its weight, a Student t variable is normal, of the precision that its slope has along the secant to its centre
-    (Lange, Little and Taylor, JASA 84 (1989) 881). The curvature at a far one is no precision: it may be negative.
-    """
-    found, sites = np.full(len(x), np.nan), problem.declaration.sites
-    own = [b.index for b in active.blocks if b.owner is None and sites[b.name].distribution in _HEAVY]
-    if not own:
-        return found
-    index = np.unique(np.concatenate([i.reshape(-1) for i in own]))
-    centre = x.copy()
-    centre[index] = 0.0
-    level = np.abs(problem.compiled.prior(centre, directions)[0][index]) < _LEVEL
-    away = level & (np.abs(x[index]) > _LEVEL)
-    found[index[away]] = -slope[index[away]] / x[index[away]]
-    return found
-
-
-def _along_secant(precision: np.ndarray, secant: np.ndarray) -> np.ndarray:
-    """Precision (..., i, i) with other entries on its diagonal where these are numbers."""
-    told = np.isfinite(secant)
-    apart = np.where(told[..., :, None] | told[..., None, :], 0.0, precision)
-    return apart + np.where(told, secant, 0.0)[..., None] * np.eye(secant.shape[-1])
-
-
-def _known(slope: np.ndarray, precision: np.ndarray, information: np.ndarray) -> Known:
-    """From slope (..., i) and precision (..., i, i) of a log prior; what the data know far better is not known before."""
-    alone = np.eye(slope.shape[-1])
-    informative = np.einsum("...ii->...i", precision) > _FAINT * information
-    both = informative[..., :, None] & informative[..., None, :]
-    covariance = np.where(both, np.linalg.inv(positive(np.where(both, precision, alone))), 0.0)
-    root = np.where(both, np.linalg.cholesky(positive(covariance + ~informative[..., None] * alone)), 0.0)
-    return Known(-np.einsum("...ij,...j->...i", covariance, slope), root)

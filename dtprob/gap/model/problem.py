@@ -15,6 +15,7 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy import special
 
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.errors import InputError
@@ -40,8 +41,9 @@ from dtprob.models.declaration import Declaration, declare
 from dtprob.models.supported import check_supported
 
 _REFERENCE_DRAWS = 1000
-_MIDDLE = 2.563
-"""Standard deviations between the first and the last tenth of a normal distribution."""
+_TENTH = 1.2815515655446004
+"""Standard deviations from a normal distribution's middle to its last tenth."""
+_SCORES = sorted([*np.linspace(-3.0, 3.0, 25).tolist(), -_TENTH, _TENTH])
 
 
 @final
@@ -99,7 +101,7 @@ class Problem:
             self._lay_out()
 
     def _declare(self, model: Model, static: Any) -> None:
-        for name in ("prior_middle", "usual"):  # of sites that may have another name now
+        for name in ("_prior_quantiles", "prior_middle", "usual"):  # of sites that may have another name now
             self.__dict__.pop(name, None)
         self.model = model
         self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
@@ -345,11 +347,21 @@ class Problem:
         return np.where(np.isfinite(x), x, 0.0)
 
     @cached_property
+    def _prior_quantiles(self) -> np.ndarray:
+        """Of prior draws of each coordinate (score, dimension), at the normal scores `_SCORES`."""
+        draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
+        return np.quantile(draws, special.ndtr(_SCORES), axis=0)
+
+    @cached_property
     def prior_middle(self) -> tuple[np.ndarray, np.ndarray]:
         """Median and standard deviation, by the middle eight tenths of the prior, of each coordinate (dimension,)."""
-        draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
-        low, middle, high = np.quantile(draws, [0.1, 0.5, 0.9], axis=0)
-        return middle, (high - low) / _MIDDLE
+        low, middle, high = (self._prior_quantiles[_SCORES.index(s)] for s in (-_TENTH, 0.0, _TENTH))
+        return middle, (high - low) / (2 * _TENTH)
+
+    def prior_score(self, x: np.ndarray) -> np.ndarray:
+        """Normal scores of the base model's coordinates of a point among draws of the prior, at most 3 from 0."""
+        values = self._prior_quantiles.T
+        return np.array([np.interp(x[i], own, _SCORES) for i, own in enumerate(values)])
 
     @cached_property
     def usual(self) -> dict[str, tuple[float, float]]:
