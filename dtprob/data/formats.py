@@ -128,14 +128,17 @@ def _read_zarr(path: Path) -> Arrays:
 def _read_csv(path: Path) -> Arrays:
     import pandas as pd  # noqa: PLC0415  (slow to import, needed for tables only)
 
-    header = pd.read_csv(path, header=None, nrows=1, dtype=str).iloc[0].tolist()
-    twice = sorted({str(name) for name in header if header.count(name) > 1})
+    first = pd.read_csv(path, header=None, nrows=1, dtype=str).iloc[0]
+    header = [name.strip() if isinstance(name, str) else "" for name in first]
+    twice = sorted({str(name) for name in header if name and header.count(name) > 1})
     if twice:
         raise InputError(str(path), "columns of different names", f"{twice[0]!r} twice", "Rename one of them")
     if len(header) == 1 and ";" in str(header[0]):
         got, remedy = f"one, {header[0]!r}", "Write commas for semicolons, and points in numbers"
         raise InputError(str(path), "columns that commas separate", got, remedy)
-    return _columns(pd.read_csv(path))
+    table = pd.read_csv(path, header=0, names=[name or f"column {i + 1}" for i, name in enumerate(header)])
+    unnamed = [f"column {i + 1}" for i, name in enumerate(header) if not name]
+    return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
 
 
 def _read_parquet(path: Path) -> Arrays:

@@ -15,7 +15,7 @@ from dtprob.gap.compose import compose
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.integrated import based
-from dtprob.gap.fitting.soundness import idle, notes
+from dtprob.gap.fitting.soundness import check_noise, idle, notes
 from dtprob.gap.fitting.states import held
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
@@ -70,8 +70,8 @@ def diagnose(
 
     Raises:
         InputError: effects on absent sites, effects that change the model at their null, fewer than four
-            clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end, or a
-            base model that does not fit.
+            clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end, a base
+            model that does not fit, or one that meets the data exactly.
     """
     check_indices(model, data)
     problem = Problem(model, data, effects, cluster, reference)
@@ -104,6 +104,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     say(f"fitting the base model to {problem.n_cluster} clusters")
     start = based(problem, keys[0], polished=settings.polished, say=say)
     problem, base = start.problem, start.fitted
+    check_noise(problem, base)
     noted = notes(problem, base)
     for note in noted:
         say(f"note: {note}")

@@ -59,9 +59,10 @@ def axes_of(
 def lent(
     shape: tuple[int, ...], axes: tuple[str, ...], observed: Sequence[tuple[tuple[int, ...], tuple[str, ...]]]
 ) -> tuple[str, ...]:
-    """Axes of a site, those that nothing names called as the axes of observed sites that they are broadcast to.
+    """Axes of a site, those that nothing names called as the axes of observed sites that they go with.
 
-    Where these do not agree, they stay unnamed.
+    These are the last ones of what the site is broadcast to; or the first ones of the site itself where it has more, as the
+    logits of classes have. Where observed sites do not agree, the axes stay unnamed.
 
     Args:
         shape: of the site.
@@ -69,9 +70,11 @@ def lent(
         observed: shapes and axes of the observed sites.
     """
     found = list(axes)
-    fits = [names for wide, names in observed if _is_part(shape, wide)]
+    fits = [names[len(names) - len(shape) :] for wide, names in observed if _is_part(shape, wide)]
+    if not fits:
+        fits = [names for wide, names in observed if _is_part(shape[: len(wide)], wide)]
     for i, axis in enumerate(axes):
-        names = {one[i - len(axes)] for one in fits}
+        names = {one[i] for one in fits if i < len(one)}
         if is_unnamed(axis) and shape[i] > 1 and len(names) == 1 and not names & {*axes}:
             found[i] = names.pop()
     return tuple(found)

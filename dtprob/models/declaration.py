@@ -229,7 +229,7 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
             f"model {declaration.name}",
             "an observed site",
             "none",
-            "Pass the observed data, and give it to numpyro.sample as obs.",
+            "Pass the observed data, and give it to numpyro.sample as obs; a numpyro.factor counts as a prior.",
         )
     for name, measure in notes.measures.items():
         if measure.site not in declaration.observed:

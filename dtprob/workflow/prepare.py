@@ -21,8 +21,8 @@ from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
 from dtprob.models.arguments import Model
 from dtprob.models.declaration import declare
-from dtprob.models.indices import check_indices
 from dtprob.usercode import load_object
+from dtprob.workflow.columns import check_columns
 from dtprob.workflow.models import MODELS
 from dtprob.workflow.scene import reached
 
@@ -189,7 +189,7 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
     own = [] if arrange is None else list(inspect.signature(arrange).parameters)[1:]
     arguments |= _options(case, takes, arguments, own)
     if case.model.name not in MODELS:
-        check_indices(model, arguments, f"{file.name}, column")
+        check_columns(file, model, arguments, columns)
     return arguments
 
 

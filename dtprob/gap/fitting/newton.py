@@ -12,6 +12,8 @@ from scipy import linalg
 _EDGES: Final = 8
 """Times that more coordinates are put on their edge before the others' step is taken as it is."""
 
+_ENDLESS: Final = 1e100
+"""Curvatures whose squares may still be multiplied are below."""
 _SAFE: Final = 1e-5
 """Smallest diagonal of a Cholesky factor at which a scaled curvature is taken as it is."""
 
@@ -39,7 +41,7 @@ class System:
     @property
     def finite(self) -> bool:
         """Whether a step can be told: far out a curvature may overflow where the log posterior does not."""
-        return all(np.isfinite(part).all() for part in vars(self).values())
+        return all((np.abs(part) < _ENDLESS).all() for part in vars(self).values())
 
 
 class NewtonStep(NamedTuple):

@@ -17,6 +17,8 @@ from dtprob.gap.model.problem import Problem
 
 UNSEEN: Final = "nothing observed depends on it"
 """What hides an effect that does nothing."""
+_VANISHED: Final = 1e-12
+"""Share of the largest observed value below which a spread is rounding."""
 _MISFIT: Final = 30.0
 """Residuals as many times the spread that the model allows are no fit."""
 _SINGULAR: Final = 1e-8
@@ -62,6 +64,24 @@ def broken(problem: Problem, starts: Sequence[np.ndarray]) -> InputError:
         f"none from any of {len(starts)} starts, though all its sites are finite",
         f"Check that {', '.join(problem.declaration.observed)} can take the values of the data, in the same units",
     )
+
+
+def check_noise(problem: Problem, fitted: Fit) -> None:
+    """Refuse data that a model meets exactly, as it does those of a stuck sensor: nothing is left to judge a gap by.
+
+    Raises:
+        InputError: the spread of an observed site has vanished in the fit.
+    """
+    for name, observed in problem.compiled.observations(fitted.x).items():
+        scale, seen = observed.parameters.get("scale"), np.abs(problem.observed_values[name])
+        largest = float(seen.max(initial=0.0)) or 1.0  # what is 0 throughout has no unit
+        if scale is not None and np.all(np.asarray(scale) < _VANISHED * largest):
+            raise InputError(
+                f"data {problem.declaration.observed[name].argument or name}",
+                f"values that scatter about the model {problem.declaration.name}",
+                "values that it meets exactly, with no noise left",
+                "Leave out what a stuck sensor gives, or observe what the values are rounded from",
+            )
 
 
 def _counted(bad: np.ndarray) -> str:

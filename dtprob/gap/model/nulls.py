@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.effect import Context, Effect
@@ -9,6 +13,7 @@ from dtprob.effects.library import FAMILIES
 from dtprob.effects.rewriting import rewritten
 from dtprob.errors import InputError
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.model.rewrites import derivative, null_vector
 
 _ROUNDING = 1e-5
 """Share of the largest value of a site that single precision may lose."""
@@ -18,7 +23,7 @@ def check_nulls(problem: Problem) -> None:
     """Look at each mean effect whose family the library lacks: at its null, sites have to stay what they are.
 
     Raises:
-        InputError: one changes a site there, or makes it infinite or not a number.
+        InputError: one changes a site there, or makes it infinite or not a number, or has no slope there.
     """
     own = [e for e in problem.effects if e.kind == "mean" and e.family not in FAMILIES]
     if not own:
@@ -39,6 +44,7 @@ def check_nulls(problem: Problem) -> None:
                     f"up to {off:.3g} away from values up to {size:.3g}",
                     "Make the rewrite the identity there, or give the parameter another null",
                 )
+        _check_slope(effect, values, context)
 
 
 def _check_finite(effect: Effect, site: str, before: np.ndarray, after: np.ndarray) -> None:
@@ -53,6 +59,23 @@ def _check_finite(effect: Effect, site: str, before: np.ndarray, after: np.ndarr
             f"{int(lost.sum())} of {lost.size} that are not",
             f"Look for missing values in {read}; leave those rows out or fill them",
         )
+
+
+def _check_slope(effect: Effect, values: Mapping[str, jax.Array], context: Context) -> None:
+    """What has no slope at its null, as a parameter's square or root, has no score there."""
+    what, null = f"effect {effect.name}", null_vector(effect)
+    slopes = [np.asarray(derivative(effect, site, values[site], null, context)) for site in effect.rewrites]
+    if not all(np.isfinite(slope).all() for slope in slopes):
+        remedy = "Keep the rewrite smooth there; see where a root or an absolute value acts on a parameter"
+        raise InputError(what, "a finite derivative at its null", "another", remedy)
+    moved = {name: jnp.asarray(value) + 1.0 for name, value in effect.null().items()}
+    after = (rewritten(effect, site, values[site], moved, context) for site in effect.rewrites)
+    acts = any(
+        (np.asarray(a) != np.asarray(values[s])).any() for a, s in zip(after, effect.rewrites, strict=True)
+    )
+    if acts and not any(slope.any() for slope in slopes):
+        remedy = "Let a parameter enter by its first power, as p['b'] for p['b'] ** 2"
+        raise InputError(what, "a derivative at its null that is not 0", "0", remedy)
 
 
 def _named(values: dict[str, object]) -> str:

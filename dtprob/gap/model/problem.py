@@ -200,7 +200,11 @@ class Problem:
         return Programs(self.effects, self.data)
 
     def _check_effects(self) -> None:
+        names = [effect.name for effect in self.effects]
         for effect in self.effects:
+            if names.count(effect.name) > 1:
+                remedy = "Give each effect a name of its own"
+                raise InputError("effects", "one of each name", f"several named {effect.name!r}", remedy)
             missing = [site for site in effect.sites if site not in self.declaration.sites]
             if missing:
                 raise InputError(

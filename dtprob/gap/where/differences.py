@@ -19,7 +19,7 @@ from scipy import sparse, stats
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
-from dtprob.gap.where.curves import columns, whole_columns
+from dtprob.gap.where.data_columns import columns, whole_columns
 from dtprob.models.declaration import Site
 
 _FEWEST: Final = 4

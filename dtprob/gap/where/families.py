@@ -17,7 +17,9 @@ from scipy import sparse
 
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import likelihood
-from dtprob.gap.where.curves import Curves, Quantity, cycles, stretches
+from dtprob.gap.where.curves import Curves, cycles, stretches
+from dtprob.gap.where.quantities import Quantity
+from dtprob.models.axes import is_unnamed
 
 _BAND: Final = 6
 """Entries of an axis from which it may be a band, whose mirror frequency an imbalance of I and Q brings in."""
@@ -219,11 +221,17 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
         if (kept := quantity.kept(site.axes, site.value.shape)) is not None:
             yield from (Pattern(found.label, kept, found) for found in all_curves)
             rest = tuple(range(len(kept), site.value.ndim))
-            if rest and not quantity.ordered and kept == tuple(range(len(kept))):
+            classes = all(is_unnamed(site.axes[i]) for i in rest) and _size(site, rest) <= _COLUMNS
+            if rest and (classes or not quantity.ordered) and kept == tuple(range(len(kept))):
                 each = " x ".join(site.axes[i] for i in rest)
                 yield from (Pattern(f"{found.label} x {each}", kept + rest, found) for found in all_curves)
     yield from _cycles(site)
     yield from _stretches(site)
+
+
+def _size(site: Site, axes: Sequence[int]) -> int:
+    """Positions along some axes."""
+    return int(np.prod([site.value.shape[i] for i in axes], dtype=int))
 
 
 def _stretches(site: Site) -> Iterator[Pattern]:

@@ -24,11 +24,13 @@ from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
-from dtprob.gap.where.curves import Quantity, curves, groups, quantity, whole_columns
+from dtprob.gap.where.curves import curves
+from dtprob.gap.where.data_columns import whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.moments import further_moments, moment
+from dtprob.gap.where.quantities import Quantity, groups, quantity
 from dtprob.gap.where.suspects import Suspect, suspects
 
 _SURE: Final = 0.005

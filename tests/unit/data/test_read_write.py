@@ -351,3 +351,12 @@ def test_tables_that_would_be_misread_are_refused(tmp_path, text, what):
     path.write_text(text)
     with pytest.raises(InputError, match=what):
         read_table(path)
+
+
+def test_blanks_around_names_and_a_trailing_comma_are_forgiven(tmp_path):
+    (tmp_path / "t.csv").write_text(" distance , level,\n1.0,2.0,\n3.0,4.0,\n")
+    found = read_table(tmp_path / "t.csv").columns
+    assert {name: column.tolist() for name, column in found.items()} == {
+        "distance": [1.0, 3.0],
+        "level": [2.0, 4.0],
+    }

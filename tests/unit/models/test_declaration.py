@@ -120,6 +120,17 @@ def test_what_is_computed_outside_of_a_plate_has_the_axes_of_what_is_observed():
     assert found.sites["of_row"].axes == (found.sites["y"].axes[0], "of_row_dim_1")
 
 
+def test_logits_of_classes_have_the_axes_of_what_is_observed_first():
+    def schemes(snr, mcs=None):
+        slope = numpyro.sample("slope", dist.Normal(0.0, 1.0).expand([4]).to_event(1))
+        with numpyro.plate("row", snr.shape[0]):
+            logits = numpyro.deterministic("logits", slope * snr[:, None])
+            numpyro.sample("mcs", dist.Categorical(logits=logits), obs=mcs)
+
+    sites = declare(schemes, {"snr": np.ones(9), "mcs": np.zeros(9, int)}).sites
+    assert sites["logits"].axes == ("row", "logits_dim_1")
+
+
 def test_where_observed_sites_do_not_agree_an_axis_has_no_name():
     def two(y, z):
         mean = numpyro.deterministic("mean", jnp.ones(5) * numpyro.sample("a", dist.Normal()))

@@ -124,6 +124,41 @@ def test_what_breaks_is_named_before_effects_are_tried(model, spoilt, text):
         diagnose(model, data, [bend()], key=jax.random.key(0), engine=Laplace())
 
 
+def free_noise(x, y=None):
+    """A line whose noise may vanish."""
+    level, slope = (numpyro.sample(name, dist.Normal(0.0, 3.0)) for name in ("level", "slope"))
+    noise = numpyro.sample("noise", dist.HalfNormal(2.0))
+    with numpyro.plate("sample", x.shape[0]):
+        mean = numpyro.deterministic("mean", level + slope * x)
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+
+@pytest.mark.parametrize(
+    ("level", "slope"), [(0.0, 0.0), (1.0, 0.0), (1.0, 2.0)], ids=["off", "stuck", "noiseless"]
+)
+def test_data_that_do_not_scatter_are_refused(level, slope):
+    x = np.linspace(-1.0, 1.0, 30)
+    with pytest.raises(InputError, match=r"data y: expected values that scatter .* no noise left"):
+        diagnose(free_noise, {"x": x, "y": level + slope * x}, key=jax.random.key(0), engine=Laplace())
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_spread_below_its_priors_scale_in_few_rows_is_no_gap(seed):
+    """Of four seeds, two rang at p below 1e-9 when the prior of a spread was taken as normal where it is flat."""
+    rng = np.random.default_rng(seed)
+    x = rng.uniform(-1.0, 1.0, 8)
+
+    def few(x, y=None):
+        numbers = [numpyro.sample(name, dist.Normal(0.0, 5.0)) for name in ("level", "slope")]
+        noise = numpyro.sample("noise", dist.HalfNormal(10.0))
+        with numpyro.plate("sample", x.shape[0]):
+            mean = numpyro.deterministic("mean", numbers[0] + numbers[1] * x)
+            numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+    data = {"x": x, "y": 1.0 + 2.0 * x + rng.normal(size=8)}
+    assert diagnose(few, data, key=jax.random.key(1), engine=Laplace()).verdict == "NO_GAP"
+
+
 def test_effects_that_do_nothing_are_named():
     with pytest.raises(InputError, match="a site to rewrite"):
         Effect("none", {}, (Parameter("c", dist.Normal(0.0, 1.0)),))

@@ -52,3 +52,27 @@ def test_a_missing_value_in_a_column_of_an_effect_is_told():
         InputError, match=r"effect marked: expected finite values of site 'mean', got 1 of .* in mark"
     ):
         check_nulls(Problem(line, data, [marked]))
+
+
+@pytest.mark.parametrize(
+    ("rewrite", "message"),
+    [
+        (lambda v, p, c: v + p["by"] ** 2, "expected a derivative at its null that is not 0, got 0"),
+        (lambda v, p, c: v + np.sqrt(2.0) * p["by"] ** 0.5, "a finite derivative at its null"),
+    ],
+    ids=["square", "root"],
+)
+def test_an_effect_without_a_slope_at_its_null_is_refused(rewrite, message):
+    bent = Effect("bent", {"mean": rewrite}, (Parameter("by", dist.HalfNormal()),))
+    with pytest.raises(InputError, match=f"effect bent: expected {message}|effect bent.*{message}"):
+        check_nulls(Problem(line, draw("line"), [bent]))
+
+
+def test_an_effect_that_acts_on_none_of_the_data_passes():
+    nothing = Effect("far", {"mean": lambda v, p, c: v + 0.0 * p["by"]}, (Parameter("by", dist.Normal()),))
+    check_nulls(Problem(line, draw("line"), [nothing]))
+
+
+def test_two_effects_of_one_name_are_refused():
+    with pytest.raises(InputError, match="effects: expected one of each name, got several named 'bend'"):
+        Problem(line, draw("line"), [bend(), bend()])

@@ -10,9 +10,10 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.where.curves import Quantity, curves, cycles, groups, quantity
+from dtprob.gap.where.curves import curves, cycles
 from dtprob.gap.where.families import deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import family_test
+from dtprob.gap.where.quantities import Quantity, groups, quantity
 from tests.unit.gap.examples import bend, draw, line
 
 LENGTH = 40

@@ -1,10 +1,14 @@
 """Ways to vary over what a model computes: by value where it takes few values, as entries of a table are."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from scipy import sparse
 
-from dtprob.gap.where.curves import groups, quantity
+from dtprob.gap.where.curves import curves
+from dtprob.gap.where.data_columns import whole_columns
+from dtprob.gap.where.quantities import groups, quantity
 
 
 @pytest.fixture
@@ -62,3 +66,52 @@ def test_groups_are_of_whole_numbers_that_come_often():
     assert next(anywhere.curves()).label == "along code"  # so many that near ones may act alike
     assert not list(each.curves())
     assert not list(together.curves())
+
+
+def test_flags_stored_as_real_numbers_make_groups_too():
+    shut = np.random.default_rng(2).integers(0, 2, (10, 40))
+    stored, whole = (list(groups("shut", ("link", "place"), shut.astype(kind))) for kind in (float, int))
+    assert (
+        [q.name for q in stored] == [q.name for q in whole] == ["shut", "shut of each place", "shut of all"]
+    )
+    assert not list(groups("level", ("link", "place"), np.random.default_rng(3).normal(size=(10, 40))))
+
+
+def test_columns_that_are_broadcast_lie_on_the_observations_axes():
+    seen, name = np.zeros((2, 8, 6)), "shut"
+    for shape, found in (((8, 6), True), ((2, 1, 6), True), ((1, 6), True), ((8, 5), False), ((6,), False)):
+        column = np.arange(np.prod(shape)).reshape(shape)
+        problem = SimpleNamespace(data={name: column}, responses=frozenset())
+        got = whole_columns(problem, SimpleNamespace(shape=seen.shape))
+        assert (name in got) == found
+        if found:
+            np.testing.assert_array_equal(got[name], np.broadcast_to(column, seen.shape))
+
+
+def pairs(**columns):
+    size = len(next(iter(columns.values())))
+    observed = {"y": SimpleNamespace(axes=("row",), shape=(size,))}
+    declaration = SimpleNamespace(observed=observed)
+    problem = SimpleNamespace(data=columns, responses=frozenset(), declaration=declaration)
+    return {found.label: found.values for found in curves(problem, "row", size)}
+
+
+def test_two_columns_of_whole_numbers_make_cells():
+    band, day = np.repeat(np.arange(3), 40), np.tile(np.arange(4), 30)
+    cells = pairs(band=band, day=day)["by band and day"].toarray()
+    assert cells.shape == (12, 120)
+    assert {(b, d) for row in cells for b, d in zip(band[row > 0], day[row > 0], strict=True)} == {
+        (b, d) for b in range(3) for d in range(4)
+    }
+    assert all(len({*zip(band[row > 0], day[row > 0], strict=True)}) == 1 for row in cells)
+    assert "by band and day" not in pairs(band=band[::3], day=np.arange(40) // 2)  # hardly a reading in each
+
+
+def test_a_line_along_one_column_may_differ_by_another():
+    rng = np.random.default_rng(4)
+    band, distance = np.repeat(np.arange(3), 40), rng.uniform(size=120)
+    lines = pairs(band=band, distance=distance)["along distance by band"].toarray()
+    assert lines.shape == (3, 120)
+    for b, line in enumerate(lines):
+        assert not line[band != b].any()
+        assert abs(np.corrcoef(line[band == b], distance[band == b])[0, 1]) == pytest.approx(1.0)

@@ -1,0 +1,53 @@
+"""Columns of the data that lie along the axes of what is observed."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import numpy as np
+
+from dtprob.gap.model.problem import Problem
+from dtprob.models.declaration import Site
+
+
+def columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
+    """Columns of the data (size,) that lie along an axis of the observations and vary; of positions each coordinate."""
+    if not any(axis in site.axes for site in problem.declaration.observed.values()):
+        return {}
+    found: dict[str, np.ndarray] = {}
+    for name, column in _given(problem):
+        if column.shape == (size,):
+            found[name] = column
+        elif column.ndim == 2 and column.shape[0] == size and column.shape[1] <= 3:
+            found |= {f"{name}[{i}]": part for i, part in enumerate(column.T)}
+    real = (np.floating, np.integer, np.bool_)
+    return {
+        name: column
+        for name, column in found.items()
+        if any(np.issubdtype(column.dtype, kind) for kind in real) and len(np.unique(column)) > 1
+    }
+
+
+def whole_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
+    """Columns of the data that lie on several axes of an observed site, with an entry for each observation."""
+    return {
+        name: np.broadcast_to(column, site.shape)
+        for name, column in _given(problem)
+        if column.ndim > 1 and _is_within(column.shape, site.shape)
+    }
+
+
+def _is_within(shape: tuple[int, ...], wide: tuple[int, ...]) -> bool:
+    """Whether an array of a shape is broadcast to another one."""
+    try:
+        return np.broadcast_shapes(shape, wide) == wide
+    except ValueError:
+        return False
+
+
+def _given(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of the data, but for what tells what was observed."""
+    for name, values in problem.data.items():
+        if name not in problem.responses and eqx.is_array_like(values):
+            yield name, np.asarray(values)

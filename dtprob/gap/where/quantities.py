@@ -1,0 +1,86 @@
+"""Quantities of several axes, data or what a model computes, over which a perturbation may vary."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from dtprob.gap.where.curves import ORDER, SMOOTH_FROM, Curves, grouped, over_column
+from dtprob.models.axes import is_unnamed
+
+_LARGEST: Final = 1 << 18
+"""Numbers that the curves over one quantity may take in a band."""
+_FINEST_OVER: Final = 64
+"""Half waves of the finest ripple over a quantity of several axes or a site."""
+_OFTEN: Final = 24
+"""Times that a quantity takes each of its values, on average, where each of them may be off by an amount of its own."""
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """What the model computes or the data tell at positions of some axes, over which a perturbation may vary.
+
+    Attributes:
+        name: the site or the column.
+        axes: along which it varies.
+        values: at their positions.
+        ordered: whether its values are more than names: near ones may act alike.
+    """
+
+    name: str
+    axes: tuple[str, ...]
+    values: np.ndarray
+    ordered: bool = True
+
+    def kept(self, axes: Sequence[str], shape: Sequence[int]) -> tuple[int, ...] | None:
+        """Which of a site's axes are this one's; None where it lies on others."""
+        agree = all(a == b or is_unnamed(a) or is_unnamed(b) for a, b in zip(self.axes, axes, strict=False))
+        if agree and self.values.shape == tuple(shape):
+            return tuple(range(len(shape)))
+        place = [axes.index(axis) for axis in self.axes if axis in axes]
+        whole = len(place) == len(self.axes) and place == sorted(place)
+        return tuple(place) if whole and self.values.shape == tuple(shape[i] for i in place) else None
+
+    def curves(self) -> Iterator[Curves]:
+        """Smooth, and ripples over its values; where it takes few, by value, as entries of a table are."""
+        flat = self.values.reshape(-1)
+        if ORDER * flat.size > _LARGEST:
+            return
+        distinct, index = np.unique(flat, return_inverse=True)
+        if _OFTEN * len(distinct) <= flat.size:
+            yield Curves(f"by value of {self.name}", grouped(index))
+        if self.ordered:
+            yield from over_column(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
+
+
+def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | None:
+    """A real site or column, on the axes along which it varies; None where too few of its values differ."""
+    if not np.issubdtype(values.dtype, np.floating) or not np.isfinite(values).all():
+        return None
+    wide = [i for i, n in enumerate(values.shape) if n > 1 and (values != values.take([0], i)).any()]
+    values = values[tuple(slice(None) if i in wide else 0 for i in range(values.ndim))]
+    if len(np.unique(values)) < SMOOTH_FROM:
+        return None
+    return Quantity(name, tuple(axes[i] for i in wide), values)
+
+
+def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quantity]:
+    """What a column of whole numbers, or of few others, on several axes tells apart, as what each device did last.
+
+    Each of its values, anywhere and at each position of the last axis, and what it holds along that axis all together.
+    """
+    if values.ndim < 2 or values.dtype.kind not in "biuf":
+        return
+    last, (distinct, index) = values.shape[-1], np.unique(values, return_inverse=True)
+    few = len(distinct) < SMOOTH_FROM and bool(np.isfinite(distinct).all())
+    if len(distinct) < 2 or not (few or values.dtype.kind != "f"):
+        return
+    yield Quantity(name, tuple(axes), values, ordered=_OFTEN * len(distinct) > values.size)
+    each = last * index.reshape(values.shape) + np.arange(last)
+    yield Quantity(f"{name} of each {axes[-1]}", tuple(axes), each, ordered=False)
+    if last > 1:
+        _, rows = np.unique(values.reshape(-1, last), axis=0, return_inverse=True)
+        yield Quantity(f"{name} of all", tuple(axes[:-1]), rows.reshape(values.shape[:-1]), ordered=False)
