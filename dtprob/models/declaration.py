@@ -278,6 +278,8 @@ def _site(message: Mapping[str, Any], notes: Metadata, data: Data) -> Site | Non
     event_dim = fn.event_dim if fn is not None else 0
     shape = tuple(np.shape(value))
     if kind == "observed":
+        if not eqx.is_array_like(value):
+            raise InputError(f"observed site {name!r}", "numbers", "text", "Write each value as a number")
         _check_shape(name, shape, fn)
     return Site(
         name=name,

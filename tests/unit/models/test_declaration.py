@@ -120,6 +120,12 @@ def test_what_is_computed_outside_of_a_plate_has_the_axes_of_what_is_observed():
     assert found.sites["of_row"].axes == (found.sites["y"].axes[0], "of_row_dim_1")
 
 
+def test_observed_values_are_numbers():
+    given = {"distance": jnp.ones(2), "height": jnp.ones(2), "y": ["-60.1", "-61.0"]}
+    with pytest.raises(InputError, match="observed site 'y': expected numbers, got text"):
+        declare(outside, given)
+
+
 def test_logits_of_classes_have_the_axes_of_what_is_observed_first():
     def schemes(snr, mcs=None):
         slope = numpyro.sample("slope", dist.Normal(0.0, 1.0).expand([4]).to_event(1))
