@@ -37,7 +37,10 @@ def refuse_unsupported(model: Model, name: str, message: Mapping[str, Any]) -> N
     """
     what = f"model {model_name(model)}"
     if message["type"] == "param":
-        remedy = "Declare it with numpyro.sample and a prior"
+        learned = name.endswith("_centered")
+        remedy = (
+            "Give LocScaleReparam centered=0" if learned else "Declare it with numpyro.sample and a prior"
+        )
         raise InputError(what, "latent sites with priors", f"the parameter site {name!r}", remedy)
     if message["type"] == "plate":
         size, subsample = message["args"]

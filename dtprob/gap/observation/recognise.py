@@ -16,6 +16,14 @@ from dtprob.gap.observation.normal_scores import NORMAL_SCORES
 
 _WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
 """What changes the shape or the weight of a distribution and not its density."""
+_IN_TURN: Final = "the first of all, the second of what the first leaves, and so on"
+_INSTEAD: Final = {
+    **dict.fromkeys(
+        ("MultinomialProbs", "MultinomialLogits"), f"Observe Binomial counts of the classes: {_IN_TURN}"
+    ),
+    "Dirichlet": f"Observe Beta shares: {_IN_TURN}",
+}
+"""What says the same in distributions that are known, by the name of one that is not."""
 
 
 class _Found(NamedTuple):
@@ -52,10 +60,10 @@ def recognised(fn: Any, value: Any, name: str) -> tuple[str, dict[str, jax.Array
     if found is None:
         raise InputError(
             f"observed site {name!r}",
-            f"a distribution among {', '.join(LIKELIHOODS)}, or one of them that is "
-            f"{', '.join(COMPOUNDS)} (the last six: of {', '.join(NORMAL_SCORES)})",
+            f"a distribution among {', '.join(LIKELIHOODS)}, a kind of these such as OrderedLogistic or NegativeBinomial2, "
+            f"or one of them that is {', '.join(COMPOUNDS)} (the last six: of {', '.join(NORMAL_SCORES)})",
             _described(fn),
-            "Declare the observation with one of these to diagnose its gap.",
+            _INSTEAD.get(type(fn).__name__, "Declare the observation with one of these to diagnose its gap."),
         )
     parameters = {}
     for parameter, given in found.parameters.items():

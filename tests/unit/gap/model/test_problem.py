@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from numpyro.infer.reparam import LocScaleReparam
 from numpyro.infer.util import log_density, potential_energy
 
 from dtprob.effects.effect import Effect, Parameter
@@ -270,10 +271,18 @@ def with_part(x, y):
         numpyro.sample("y", dist.Normal(level, 1.0), obs=y[rows])
 
 
+def with_learned_centring(x, y=None):
+    with numpyro.handlers.reparam(config={"level": LocScaleReparam()}):
+        level = numpyro.sample("level", dist.Normal(numpyro.sample("offset", dist.Normal()), 1.0))
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+
 @pytest.mark.parametrize(
     ("model", "what"),
     [
-        (with_parameter, "parameter site 'level'"),
+        (with_parameter, "parameter site 'level'.*Declare it with numpyro.sample"),
+        (with_learned_centring, "parameter site 'level_centered'.*Give LocScaleReparam centered=0"),
         (with_class, "discrete latent site 'class'"),
         (with_part, "3 of 8"),
     ],

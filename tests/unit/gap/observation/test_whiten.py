@@ -333,6 +333,13 @@ def test_unknown_distribution_is_refused_by_name():
             whiten.observation(other, jnp.full((), 0.5), "y")
 
 
+def test_what_can_be_observed_instead_is_told():
+    with pytest.raises(InputError, match="Observe Binomial counts of the classes"):
+        whiten.observation(dist.Multinomial(5, probs=jnp.ones(3) / 3), jnp.array([2, 2, 1]), "y")
+    with pytest.raises(InputError, match="Observe Beta shares"):
+        whiten.observation(dist.Dirichlet(jnp.ones(3)), jnp.ones(3) / 3, "y")
+
+
 CENSORED = {
     "LeftCensored": (dist.LeftCensoredDistribution, np.maximum),
     "RightCensored": (dist.RightCensoredDistribution, np.minimum),
