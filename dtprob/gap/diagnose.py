@@ -31,6 +31,7 @@ from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.search import search
 from dtprob.gap.which.trials import Say, credit
 from dtprob.inference.engine import AbstractEngine
+from dtprob.inference.fit import resolve
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Data, Model
 from dtprob.models.indices import check_indices
@@ -44,7 +45,7 @@ def diagnose(
     effects: Sequence[Effect] = (),
     *,
     key: jax.Array,
-    engine: AbstractEngine,
+    engine: str | AbstractEngine = "laplace",
     cluster: str | None = None,
     settings: Settings = _DEFAULT,
     reference: Posterior | None = None,
@@ -59,7 +60,7 @@ def diagnose(
         effects: the candidates; those that name a site the model lacks are an error. Without any, the diagnosis tells
             whether and where there is a gap.
         key: typed JAX key; the verdict does not depend on it beyond the declared error rates.
-        engine: the engine that confirms the accepted causes and gives their sizes.
+        engine: the engine that confirms the accepted causes and gives their sizes, or its name.
         cluster: axis or data column whose values are independent of one another; by default the model's own.
         settings: levels and effort.
         reference: posterior of the model on earlier data; it becomes the prior of the nuisances, so that a change of a
@@ -73,6 +74,7 @@ def diagnose(
             clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end, a base
             model that does not fit, or one that meets the data exactly.
     """
+    engine = resolve(engine)
     check_indices(model, data)
     problem = Problem(model, data, effects, cluster, reference)
     if problem.n_cluster < 4:
