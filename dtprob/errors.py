@@ -63,5 +63,5 @@ def unknown_name(what: str, name: str, valid: Iterable[str], kind: str = "name")
 def _plural(kind: str) -> str:
     """Several of what ``kind`` names: ``keys``, ``effect families``, ``kinds of traffic``."""
     noun, of, rest = kind.partition(" of ")
-    several = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2] not in "aeiou" else f"{noun}s"
+    several = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2:-1] not in "aeiou" else f"{noun}s"
     return f"{several}{of}{rest}"

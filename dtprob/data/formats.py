@@ -52,6 +52,7 @@ def load_arrays(path: Path) -> Arrays:
     return arrays
 
 
+_UNNAMED = "column without a name, the {}th from 0"
 _REMEDY = {".zarr": "Install it with: pip install 'dtprob[zarr]'"}
 
 
@@ -128,16 +129,22 @@ def _read_zarr(path: Path) -> Arrays:
 def _read_csv(path: Path) -> Arrays:
     import pandas as pd  # noqa: PLC0415  (slow to import, needed for tables only)
 
-    first = pd.read_csv(path, header=None, nrows=1, dtype=str).iloc[0]
-    header = [name.strip() if isinstance(name, str) else "" for name in first]
+    first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
+    header = [name.strip() for name in first]
     twice = sorted({str(name) for name in header if name and header.count(name) > 1})
     if twice:
         raise InputError(str(path), "columns of different names", f"{twice[0]!r} twice", "Rename one of them")
     if len(header) == 1 and ";" in str(header[0]):
         got, remedy = f"one, {header[0]!r}", "Write commas for semicolons, and points in numbers"
         raise InputError(str(path), "columns that commas separate", got, remedy)
-    table = pd.read_csv(path, header=0, names=[name or f"column {i + 1}" for i, name in enumerate(header)])
-    unnamed = [f"column {i + 1}" for i, name in enumerate(header) if not name]
+    second = pd.read_csv(path, header=None, skiprows=1, nrows=1).iloc[0] if header else []
+    beyond = [cell for cell in second[len(header) :] if not pd.isna(cell)]
+    if beyond:
+        got, remedy = f"{len(second)} cells in the first row, {len(header)} names", "Name every column"
+        raise InputError(str(path), "a name for each column", got, remedy)
+    unnamed = [_UNNAMED.format(i) for i, name in enumerate(header) if not name]
+    names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
+    table = pd.read_csv(path, header=0, names=names, index_col=False, usecols=range(len(names)))
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
 
 

@@ -22,7 +22,7 @@ from dtprob.inference.posterior import Posterior
 from dtprob.inference.smc import SMC
 from dtprob.inference.svi import SVI
 from dtprob.inference.von_mises_em import VonMisesEM
-from dtprob.models.arguments import Model, select_arguments
+from dtprob.models.arguments import Model
 from dtprob.models.indices import check_indices
 
 ENGINES: Mapping[str, type[AbstractEngine]] = {
@@ -94,5 +94,5 @@ def fit(
         InputError: see `resolve` and `AbstractEngine`; or an index in data beyond an array's end.
     """
     used = resolve(engine, **settings)
-    check_indices(model, select_arguments(model, data))
+    check_indices(model, data)
     return used(key, model, data, options=options)

@@ -72,7 +72,7 @@ def lent(
     found = list(axes)
     fits = [names[len(names) - len(shape) :] for wide, names in observed if _is_part(shape, wide)]
     if not fits:
-        fits = [names for wide, names in observed if _is_part(shape[: len(wide)], wide)]
+        fits = [names for wide, names in observed if _leads(wide, shape)]
     for i, axis in enumerate(axes):
         names = {one[i] for one in fits if i < len(one)}
         if is_unnamed(axis) and shape[i] > 1 and len(names) == 1 and not names & {*axes}:
@@ -84,3 +84,8 @@ def _is_part(shape: tuple[int, ...], wide: tuple[int, ...]) -> bool:
     """Whether a shape of some size is broadcast to another one."""
     ends = wide[len(wide) - len(shape) :]
     return 0 < len(shape) <= len(wide) and all(n in (1, m) for n, m in zip(shape, ends, strict=True))
+
+
+def _leads(wide: tuple[int, ...], shape: tuple[int, ...]) -> bool:
+    """Whether a longer shape begins with an observed one, of whose sizes none comes again, as in a square matrix."""
+    return _is_part(shape[: len(wide)], wide) and not set(wide) & set(shape[len(wide) :])

@@ -29,12 +29,13 @@ numpyro.distributions.__dict__["distribution"] = distribution
 
 type Kind = Literal["latent", "deterministic", "observed"]
 
-_NOT_TRACED = (
+NOT_TRACED = (
     jax.errors.ConcretizationTypeError,
     jax.errors.TracerArrayConversionError,
     jax.errors.TracerIntegerConversionError,
     jax.errors.NonConcreteBooleanIndexError,
 )
+"""What JAX raises where a program asks for values that it does not know yet."""
 _METADATA = "__dtprob__"
 
 
@@ -216,7 +217,7 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
         raise InputError(
             f"model {model_name(function)}", "distributions that can be drawn from", "one that cannot", remedy
         ) from error
-    except _NOT_TRACED as error:
+    except NOT_TRACED as error:
         what, got = f"model {model_name(function)}", str(error).split("\n", maxsplit=1)[0]
         remedy = "Use jnp.where or lax.cond for `if`, jnp for np, and give sizes as plain numbers"
         raise InputError(what, "operations on arrays that JAX can trace", got, remedy) from error

@@ -12,14 +12,16 @@ import numpy as np
 from jax.experimental import checkify
 
 from dtprob.errors import InputError
-from dtprob.models.arguments import Data, Model, model_name, split_static
-from dtprob.models.declaration import trace_model
+from dtprob.models.arguments import Data, Model, select_arguments, split_static
+from dtprob.models.declaration import NOT_TRACED, trace_model
 
 _SAID: Final = re.compile(r"index (-?\d+) is out of bounds for axis \d+ with size (\d+)")
 
 
 def check_indices(model: Model, data: Data, where: str = "data") -> None:
-    """Run the model once and look at every index: beyond an array's end JAX takes the last entry without a word.
+    """Run the model once and look at indices such as `level[site]`: beyond the end JAX takes the last entry without a word.
+
+    What happens there is said by `jnp.take`, `.at[].get(mode=...)` and sums by segments, which are left alone.
 
     Args:
         model: a NumPyro model.
@@ -27,32 +29,63 @@ def check_indices(model: Model, data: Data, where: str = "data") -> None:
         where: what to call them in an error.
 
     Raises:
-        InputError: an index is beyond the end of an array.
+        InputError: an index of a column is beyond the end of an array, or the data do not match the model's arguments.
     """
-    arrays, static = split_static(data)
+    arrays, static = split_static(select_arguments(model, data))
     whole = {name: np.asarray(column) for name, column in arrays.items() if _is_of_whole_numbers(column)}
     if not whole:
         return
 
-    def run(
-        arrays: Mapping[str, Any], key: jax.Array
-    ) -> None:  # of which nothing but the indices is compiled
+    def run(arrays: Mapping[str, Any], key: jax.Array) -> None:
+        """Of which nothing but the indices is compiled."""
         trace_model(model, eqx.combine(arrays, static), key)
 
-    checked = checkify.checkify(run, errors=checkify.index_checks)
-    found, _ = jax.jit(checked)(arrays, jax.random.key(0))
-    said = _SAID.search(found.get() or "")
+    key = jax.random.key(0)
+    try:
+        found, _ = jax.jit(checkify.checkify(run, errors=checkify.index_checks))(arrays, key)
+        said = _SAID.search(found.get() or "")
+        sizes = _looked_up(jax.make_jaxpr(run)(arrays, key).jaxpr) if said else set[int]()
+    except NOT_TRACED:
+        return  # which `declare` tells
     if said is None:
         return
     index, size = map(int, said.groups())
-    beyond = {name: column for name, column in whole.items() if column.max() >= size and index in column}
-    name, column = next(iter(beyond.items()), ("", np.array(index)))
-    raise InputError(
-        f"{where} {name!r}" if beyond else f"model {model_name(model)}",
-        f"indices from 0 to {size - 1} of an array of {size}",
-        f"{column.max()}",
-        "Number from 0 and give the array, or its plate, as many entries; where it is meant, use jnp.clip",
-    )
+    beyond = {
+        n: c for n, c in whole.items() if np.isin(c, (index, index - size)).any() and not _is_within(c, size)
+    }
+    if size in sizes and beyond:
+        name, column = next(iter(beyond.items()))
+        raise InputError(
+            f"{where} {name!r}",
+            f"indices from 0 to {size - 1} of an array of {size}",
+            f"{column.max() if column.max() >= size else column.min()}",
+            "Number from 0 and give the array, or its plate, as many entries; where it is meant, use jnp.clip",
+        )
+
+
+def _looked_up(jaxpr: Any) -> set[int]:
+    """Sizes of the axes into which plain indices point, as those of `x[i]`, anywhere in a program."""
+    found: set[int] = set()
+    for equation in jaxpr.eqns:
+        given = equation.params
+        if (
+            equation.primitive.name == "gather"
+            and given["mode"] == jax.lax.GatherScatterMode.PROMISE_IN_BOUNDS
+        ):
+            shape = equation.invars[0].aval.shape
+            found |= {shape[axis] for axis in given["dimension_numbers"].start_index_map}
+        for inner in jax.tree.leaves(list(given.values()), is_leaf=_is_program):
+            if _is_program(inner):
+                found |= _looked_up(getattr(inner, "jaxpr", inner))
+    return found
+
+
+def _is_program(value: Any) -> bool:
+    return hasattr(value, "eqns") or hasattr(value, "jaxpr")
+
+
+def _is_within(column: np.ndarray, size: int) -> bool:
+    return bool(column.min() >= -size and column.max() < size)
 
 
 def _is_of_whole_numbers(column: Any) -> bool:

@@ -105,7 +105,8 @@ def prepare(
             reference = _arguments(case, model, case.data.reference, cache, say)
         if case.data.designs is not None:
             say(f"reading {case.data.designs.name}")
-            designs = {case.data.designs.stem: _arguments(case, model, case.data.designs, cache, say)}
+            found = _arguments(case, model, case.data.designs, cache, say, observed=False)
+            designs = {case.data.designs.stem: found}
         effects = _effects(case, model, arguments)
     model = _extended(case, model, arguments)
     key, digest = jax.random.key(case.seed.value), sha256(case.data.file)
@@ -162,8 +163,10 @@ def _model(case: Case) -> Model:
     return found
 
 
-def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Say) -> dict[str, Any]:
-    """The model's arguments from one data file, the scene and the options."""
+def _arguments(
+    case: Case, model: Model, file: Path, cache: Path | None, say: Say, *, observed: bool = True
+) -> dict[str, Any]:
+    """The model's arguments from one data file, the scene and the options; of designs nothing has been observed."""
     takes = inspect.signature(model).parameters
     needs_paths = "paths" in takes
     if case.model.name in MODELS:
@@ -188,7 +191,7 @@ def _arguments(case: Case, model: Model, file: Path, cache: Path | None, say: Sa
         arguments |= MODELS[case.model.name].reduced({**columns, **arguments})
     own = [] if arrange is None else list(inspect.signature(arrange).parameters)[1:]
     arguments |= _options(case, takes, arguments, own)
-    if case.model.name not in MODELS:
+    if observed and case.model.name not in MODELS:
         check_columns(file, model, arguments, columns)
     return arguments
 

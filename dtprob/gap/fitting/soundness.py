@@ -17,8 +17,8 @@ from dtprob.gap.model.problem import Problem
 
 UNSEEN: Final = "nothing observed depends on it"
 """What hides an effect that does nothing."""
-_VANISHED: Final = 1e-12
-"""Share of the largest observed value below which a spread is rounding."""
+_VANISHED: Final = 1e-14
+"""Share of the usual observed value below which a spread is rounding."""
 _MISFIT: Final = 30.0
 """Residuals as many times the spread that the model allows are no fit."""
 _SINGULAR: Final = 1e-8
@@ -73,9 +73,12 @@ def check_noise(problem: Problem, fitted: Fit) -> None:
         InputError: the spread of an observed site has vanished in the fit.
     """
     for name, observed in problem.compiled.observations(fitted.x).items():
-        scale, seen = observed.parameters.get("scale"), np.abs(problem.observed_values[name])
-        largest = float(seen.max(initial=0.0)) or 1.0  # what is 0 throughout has no unit
-        if scale is not None and np.all(np.asarray(scale) < _VANISHED * largest):
+        if not {"loc", "scale"} <= observed.parameters.keys() or observed.family == "LogNormal":
+            continue  # of another unit than the values
+        loc, scale = (np.asarray(observed.parameters[n]) for n in ("loc", "scale"))
+        seen = np.asarray(problem.observed_values[name])
+        rounding = _VANISHED * (float(np.median(np.abs(seen))) or 1.0)  # what is 0 throughout has no unit
+        if np.all(scale < rounding) and np.median(np.abs(seen - loc)) < 100 * rounding:
             raise InputError(
                 f"data {problem.declaration.observed[name].argument or name}",
                 f"values that scatter about the model {problem.declaration.name}",

@@ -16,6 +16,7 @@ from scipy import special
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.marginal import marginal
+from dtprob.gap.how_far.earlier import on_earlier_data
 from dtprob.gap.model.misses import Miss
 from dtprob.gap.model.problem import Problem
 
@@ -27,6 +28,7 @@ class HeldOut:
     Attributes:
         log_likelihood: held-out log marginal likelihood of each cluster (cluster,), with its part of what the fits cost
             on earlier data.
+        doubt: variance of that cost where nothing has changed since.
         misses: by how much predictions miss each cluster, by observed site and measure.
         estimates: the effects' parameters in each fold, {site name: (fold, *shape flattened)}.
     """
@@ -34,6 +36,7 @@ class HeldOut:
     log_likelihood: np.ndarray
     misses: Mapping[str, Miss]
     estimates: dict[str, np.ndarray]
+    doubt: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -77,22 +80,17 @@ def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
     """How fits do on the clusters that each of them has not seen."""
     log_likelihood, missed = np.zeros(problem.n_cluster), dict[str, Miss]()
     estimates: dict[str, list[np.ndarray]] = {}
+    doubt = 0.0
     for held, part in folds:
-        log_likelihood[held] = (marginal(problem, part) + _on_earlier_data(problem, part))[held]
+        earlier = on_earlier_data(problem, part)
+        log_likelihood[held] = marginal(problem, part)[held] + earlier.value / problem.n_cluster
+        doubt += earlier.variance * held.mean()
         for name, miss in problem.compiled.misses(part.x).items():
             before = missed.get(name, Miss(0.0, 0.0, 0.0))
             missed[name] = Miss(*(b + np.where(held, m, 0.0) for b, m in zip(before, miss, strict=True)))
         for block in (b for name in part.effects for b in problem.blocks_of(name) if not b.local):
             estimates.setdefault(block.name, []).append(part.x[block.index[0]])
-    return HeldOut(log_likelihood, missed, {n: np.stack(v) for n, v in estimates.items()})
-
-
-def _on_earlier_data(problem: Problem, fitted: fitting.Fit) -> float:
-    """Log density of earlier data at a fit, up to a constant, in equal parts for all clusters; 0 where there are none.
-
-    A fit that gives up what earlier data say in order to follow these does worse on those.
-    """
-    return float(problem.compiled.evaluate(fitted.x).prior) / problem.n_cluster if problem.known else 0.0
+    return HeldOut(log_likelihood, missed, {n: np.stack(v) for n, v in estimates.items()}, doubt)
 
 
 @dataclass(frozen=True)
@@ -187,7 +185,8 @@ def _fraction(gain: ArrayLike, rest: ArrayLike) -> np.ndarray:
 
 
 def _gains(before: HeldOut, after: HeldOut, key: jax.Array, draws: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gain of each cluster, and its totals over bootstrap draws of the clusters."""
+    """Gain of each cluster, and its totals over bootstrap draws of the clusters and of what earlier data say by chance."""
     gain = after.log_likelihood - before.log_likelihood
     index = np.asarray(jax.random.randint(key, (draws, len(gain)), 0, len(gain)))
-    return gain, gain[index].sum(1)
+    chance = np.sqrt(max(before.doubt - after.doubt, 0.0)) * np.asarray(jax.random.normal(key, (draws,)))
+    return gain, gain[index].sum(1) + chance

@@ -363,8 +363,9 @@ class Problem:
         return middle, (high - low) / (2 * _TENTH)
 
     def prior_score(self, x: np.ndarray) -> np.ndarray:
-        """Normal scores of the base model's coordinates of a point among draws of the prior, at most 3 from 0."""
-        values = self._prior_quantiles.T
+        """Normal scores among prior draws, at most 3 from 0, of the base model's coordinates, which are a point's first."""
+        count = sum(block.index.size for block in self.blocks_of(None))
+        values = self._prior_quantiles[:, :count].T
         return np.array([np.interp(x[i], own, _SCORES) for i, own in enumerate(values)])
 
     @cached_property

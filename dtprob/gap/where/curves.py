@@ -112,9 +112,15 @@ def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
     for one, other in list(itertools.product(smooth, made))[:_MOST_PAIRS]:
         yield Curves(f"along {one} by {other}", grouped(made[other]).multiply(_line(found[one])).tocsr())
-    for one, other in list(itertools.combinations(made, 2))[:_MOST_PAIRS]:
+    yield from itertools.islice(_cells(made, size), _MOST_PAIRS)
+
+
+def _cells(made: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
+    """By the groups of two columns, from their group of each position (size,); not where one lies within the other."""
+    for one, other in itertools.combinations(made, 2):
         cells, index = np.unique(np.stack([made[one], made[other]]), axis=1, return_inverse=True)
-        if _CELL * cells.shape[1] <= size:
+        nested = cells.shape[1] == max(made[one].max(), made[other].max()) + 1
+        if _CELL * cells.shape[1] <= size and not nested:
             yield Curves(f"by {one} and {other}", grouped(index.reshape(-1)))
 
 

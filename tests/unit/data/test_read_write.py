@@ -360,3 +360,17 @@ def test_blanks_around_names_and_a_trailing_comma_are_forgiven(tmp_path):
         "distance": [1.0, 3.0],
         "level": [2.0, 4.0],
     }
+
+
+def test_names_that_pandas_takes_for_nothing_are_names(tmp_path):
+    (tmp_path / "t.csv").write_text("NA,None,null\n1,2,3\n4,5,6\n")
+    assert list(read_table(tmp_path / "t.csv").columns) == ["NA", "None", "null"]
+
+
+def test_rows_that_end_in_a_comma_do_not_shift_columns(tmp_path):
+    (tmp_path / "t.csv").write_text("a,b\n1,2,\n3,4,\n")
+    found = read_table(tmp_path / "t.csv").columns
+    assert {name: column.tolist() for name, column in found.items()} == {"a": [1, 3], "b": [2, 4]}
+    (tmp_path / "t.csv").write_text("a,b\n1,2,3\n4,5,6\n")
+    with pytest.raises(InputError, match="a name for each column, got 3 cells in the first row, 2 names"):
+        read_table(tmp_path / "t.csv")

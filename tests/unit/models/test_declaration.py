@@ -120,6 +120,16 @@ def test_what_is_computed_outside_of_a_plate_has_the_axes_of_what_is_observed():
     assert found.sites["of_row"].axes == (found.sites["y"].axes[0], "of_row_dim_1")
 
 
+def test_a_square_matrix_has_no_axis_of_what_is_observed():
+    def square(y):
+        table = numpyro.sample("table", dist.Normal().expand([5, 5]).to_event(2))
+        table = numpyro.deterministic("twice", 2.0 * table)
+        with numpyro.plate("row", 5):
+            numpyro.sample("y", dist.Normal(table.sum(0), 1.0), obs=y)
+
+    assert declare(square, {"y": jnp.ones(5)}).sites["twice"].axes == ("twice_dim_0", "twice_dim_1")
+
+
 def test_observed_values_are_numbers():
     given = {"distance": jnp.ones(2), "height": jnp.ones(2), "y": ["-60.1", "-61.0"]}
     with pytest.raises(InputError, match="observed site 'y': expected numbers, got text"):

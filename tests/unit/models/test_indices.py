@@ -16,12 +16,23 @@ from dtprob.models.indices import check_indices
 SITES = 5
 
 
+MEANT = {
+    "held": lambda level, site: level[jnp.clip(site, 0, SITES - 1)],
+    "filled": lambda level, site: level.at[site].get(mode="fill", fill_value=0.0),
+    "taken": lambda level, site: jnp.take(level, site, mode="clip"),
+    "added": lambda level, site: level.mean() + jnp.zeros(SITES).at[site].add(1.0).sum() + 0.0 * site,
+    "summed": lambda level, site: (
+        level.mean() + jax.ops.segment_sum(1.0 * site, site, SITES).sum() + 0.0 * site
+    ),
+}
+"""Ways that say themselves what happens beyond the end."""
+
+
 def levels(site, y=None, *, how="plain"):
     """A level for each of five sites."""
     with numpyro.plate("sites", SITES):
         level = numpyro.sample("level", dist.Normal(0.0, 1.0))
-    index = jnp.clip(site, 0, SITES - 1) if how == "held" else site
-    mean = numpyro.deterministic("mean", level[index])
+    mean = numpyro.deterministic("mean", MEANT[how](level, site) if how in MEANT else level[site])
     with numpyro.plate("row", site.shape[0]):
         numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
 
@@ -43,8 +54,33 @@ def test_the_column_the_array_and_the_index_are_named():
         check_indices(levels, table(SITES))
 
 
-def test_an_index_that_is_held_on_purpose_passes():
-    check_indices(levels, {**table(SITES + 3), "how": "held"})
+@pytest.mark.parametrize("how", MEANT)
+def test_what_says_itself_what_happens_beyond_the_end_passes(how):
+    check_indices(levels, {**table(SITES + 3), "how": how})
+
+
+def test_an_index_that_no_column_holds_passes():
+    def of_level(day, y=None):
+        level = numpyro.sample("level", dist.Normal(30.0, 1.0))
+        mean = jnp.arange(4.0)[jnp.floor(level).astype(int)] + 0.0 * day
+        with numpyro.plate("row", len(day)):
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+    check_indices(of_level, {"day": np.arange(9) % 3, "y": np.zeros(9)})
+
+
+def test_what_is_wrong_with_arguments_is_told_first():
+    for given in ({**table(3), "opr": 1}, {"y": np.zeros(30), "cell": np.arange(30)}):
+        with pytest.raises(InputError, match="data for levels"):
+            diagnose(levels, given, key=jax.random.key(0))
+
+
+def test_what_cannot_be_traced_is_left_to_others():
+    def sized(site, y=None):
+        with numpyro.plate("sites", int(site.max()) + 1):
+            numpyro.sample("level", dist.Normal(0.0, 1.0))
+
+    check_indices(sized, table(SITES))
 
 
 def test_a_last_entry_counted_from_the_end_passes_and_one_before_the_first_does_not():

@@ -12,7 +12,7 @@ from dtprob.effects import Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting.base import fit_base
-from dtprob.gap.fitting.soundness import UNSEEN, idle, notes
+from dtprob.gap.fitting.soundness import UNSEEN, check_noise, idle, notes
 from dtprob.gap.model.problem import Problem
 from dtprob.inference import Laplace
 from tests.unit.gap.examples import bend, draw, inputs, line
@@ -140,6 +140,27 @@ def test_data_that_do_not_scatter_are_refused(level, slope):
     x = np.linspace(-1.0, 1.0, 30)
     with pytest.raises(InputError, match=r"data y: expected values that scatter .* no noise left"):
         diagnose(free_noise, {"x": x, "y": level + slope * x}, key=jax.random.key(0), engine=Laplace())
+
+
+def known_noise(spread, log=False):
+    def held(x, y=None):
+        level = numpyro.sample("level", dist.Normal(np.mean(x), 1.0))
+        with numpyro.plate("sample", x.shape[0]):
+            mean = numpyro.deterministic("mean", level + 0.0 * x)
+            numpyro.sample("y", (dist.LogNormal if log else dist.Normal)(mean, spread), obs=y)
+
+    return held
+
+
+def test_small_spreads_of_large_values_are_kept():
+    rng = np.random.default_rng(0)
+    noise = rng.normal(size=30)
+    for model, centre, y in (
+        (known_noise(1e-3), 1.7e9, 1.7e9 + 1e-3 * noise),  # seconds since 1970, to a millisecond
+        (known_noise(0.01, log=True), 24.0, np.exp(24.0 + 0.01 * noise)),  # Hz
+    ):
+        problem = Problem(model, {"x": np.full(30, centre), "y": y}, ())
+        check_noise(problem, fit_base(problem, jax.random.key(0)))
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -57,14 +57,14 @@ def test_a_missing_value_in_a_column_of_an_effect_is_told():
 @pytest.mark.parametrize(
     ("rewrite", "message"),
     [
-        (lambda v, p, c: v + p["by"] ** 2, "expected a derivative at its null that is not 0, got 0"),
+        (lambda v, p, c: v + p["by"] ** 2, "a derivative at its null that is not 0, got 0"),
         (lambda v, p, c: v + np.sqrt(2.0) * p["by"] ** 0.5, "a finite derivative at its null"),
     ],
     ids=["square", "root"],
 )
 def test_an_effect_without_a_slope_at_its_null_is_refused(rewrite, message):
     bent = Effect("bent", {"mean": rewrite}, (Parameter("by", dist.HalfNormal()),))
-    with pytest.raises(InputError, match=f"effect bent: expected {message}|effect bent.*{message}"):
+    with pytest.raises(InputError, match=f"effect bent: expected {message}"):
         check_nulls(Problem(line, draw("line"), [bent]))
 
 

@@ -104,6 +104,7 @@ def test_two_columns_of_whole_numbers_make_cells():
         (b, d) for b in range(3) for d in range(4)
     }
     assert all(len({*zip(band[row > 0], day[row > 0], strict=True)}) == 1 for row in cells)
+    assert "by band and part" not in pairs(band=band, part=2 * band + day % 2)  # parts of bands
     assert "by band and day" not in pairs(band=band[::3], day=np.arange(40) // 2)  # hardly a reading in each
 
 
