@@ -74,7 +74,7 @@ def diagnose(
             clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end, a base
             model that does not fit, or one that meets the data exactly.
     """
-    engine = resolve(engine)
+    engine = resolve(engine) if isinstance(engine, str) else engine
     check_indices(model, data)
     problem = Problem(model, data, effects, cluster, reference)
     if problem.n_cluster < 4:

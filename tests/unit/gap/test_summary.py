@@ -29,7 +29,7 @@ def test_what_explanations_share_is_said_first(sets, said):
 @pytest.mark.parametrize(("effects", "said"), [(("a",), "a imitates"), (("a", "b"), "a and b imitate")])
 def test_what_imitates_part_of_an_unknown_cause_is_said(effects, said):
     cause = SimpleNamespace(effects=effects, alias_class=(effects,), closed_fraction=None)
-    evidence = SimpleNamespace(after=Location((), (), {}, 1e-9))
+    evidence = SimpleNamespace(after=Location((), (), {}, 1e-9), problem=SimpleNamespace(effects=("a", "b")))
     assert summary("UNLISTED", (cause,), evidence).endswith(f" {said} part of it.")
 
 
