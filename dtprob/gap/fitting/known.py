@@ -22,6 +22,8 @@ _ALIKE: Final = 0.25
 """Share by which the centre and the spread of a normal distribution differ from those of its draws, at most."""
 _NEAR: Final = 0.5
 """Standard deviations from the prior's centre up to which a slope tells nothing of the spread."""
+_FARTHEST: Final = 3.0
+"""Standard deviations from which draws of the prior tell no longer how far out a point is."""
 _ALONE: Final = 1e-6
 """Share of its own curvature beyond which a coordinate's prior depends on another one."""
 
@@ -85,13 +87,14 @@ def _skewed(
     at = np.unique(np.concatenate([b.index.reshape(-1) for b in base])) if base else np.zeros(0, int)
     at = at[alone[at] & (np.abs(slope[at]) > _LEVEL)]
     middle, spread = (part[at] for part in problem.prior_middle)
-    score = np.maximum(np.abs(problem.prior_score(x)[at]), _NEAR)
+    drawn = np.abs(problem.prior_score(x)[at])
+    score = np.maximum(drawn, _NEAR)
     with np.errstate(divide="ignore", invalid="ignore"):
         here = 1 / np.sqrt(curvature[at])
         centre = x[at] + slope[at] * here**2
         is_normal = np.maximum(np.abs(centre - middle), np.abs(here - spread)) < _ALIKE * spread
         is_near = np.abs(slope[at]) * here < (1 + _ALIKE) * score
-    wrong = ~is_normal & ~is_near & (np.abs(curvature[at]) > _FAINT * told[at])
+    wrong = ~is_normal & ~is_near & (drawn < _FARTHEST) & (np.abs(curvature[at]) > _FAINT * told[at])
     found[at[wrong]] = (slope[at] / score)[wrong] ** 2
     return found
 
