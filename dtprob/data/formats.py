@@ -137,9 +137,11 @@ def _read_csv(path: Path) -> Arrays:
     if len(header) == 1 and ";" in str(header[0]):
         got, remedy = f"one, {header[0]!r}", "Write commas for semicolons, and points in numbers"
         raise InputError(str(path), "columns that commas separate", got, remedy)
-    second = pd.read_csv(path, header=None, skiprows=1, nrows=1).iloc[0] if header else []
-    beyond = [cell for cell in second[len(header) :] if not pd.isna(cell)]
-    if beyond:
+    try:
+        second = pd.read_csv(path, header=None, skiprows=1, nrows=1).iloc[0].tolist()
+    except pd.errors.EmptyDataError:
+        second = []
+    if not all(pd.isna(cell) for cell in second[len(header) :]):
         got, remedy = f"{len(second)} cells in the first row, {len(header)} names", "Name every column"
         raise InputError(str(path), "a name for each column", got, remedy)
     unnamed = [_UNNAMED.format(i) for i, name in enumerate(header) if not name]
