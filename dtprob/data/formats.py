@@ -131,10 +131,10 @@ def _read_csv(path: Path) -> Arrays:
 
     first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
     header = [name.strip() for name in first]
-    twice = sorted({str(name) for name in header if name and header.count(name) > 1})
+    twice = sorted({name for name in header if name and header.count(name) > 1})
     if twice:
         raise InputError(str(path), "columns of different names", f"{twice[0]!r} twice", "Rename one of them")
-    if len(header) == 1 and ";" in str(header[0]):
+    if len(header) == 1 and ";" in header[0]:
         got, remedy = f"one, {header[0]!r}", "Write commas for semicolons, and points in numbers"
         raise InputError(str(path), "columns that commas separate", got, remedy)
     try:
@@ -144,8 +144,8 @@ def _read_csv(path: Path) -> Arrays:
     if not all(pd.isna(cell) for cell in second[len(header) :]):
         got, remedy = f"{len(second)} cells in the first row, {len(header)} names", "Name every column"
         raise InputError(str(path), "a name for each column", got, remedy)
-    unnamed = [_UNNAMED.format(i) for i, name in enumerate(header) if not name]
     names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
+    unnamed = [name for name in names if name not in header]
     table = pd.read_csv(path, header=0, names=names, index_col=False, usecols=range(len(names)))
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
 

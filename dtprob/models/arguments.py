@@ -100,16 +100,25 @@ def select_arguments(function: Model, data: Data) -> dict[str, Any]:
                 repr(name),
                 f"Did you mean {hint!r}?" if hint else "Remove it, or add the argument to the model.",
             )
-    for name, parameter in parameters.items():
-        is_variadic = parameter.kind in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
-        if parameter.default is parameter.empty and not is_variadic and name not in data:
-            raise InputError(
-                f"data for {model_name(function)}",
-                f"an entry {name!r}",
-                ", ".join(data) or "nothing",
-                f"Give {name!r}, or a default in the model.",
-            )
+    for name in lacking(function, data):
+        raise InputError(
+            f"data for {model_name(function)}",
+            f"an entry {name!r}",
+            ", ".join(data) or "nothing",
+            f"Give {name!r}, or a default in the model.",
+        )
     return as_arrays(data)
+
+
+def lacking(function: Model, data: Data) -> list[str]:
+    """Arguments that a model cannot do without and the data do not hold."""
+    return [
+        name
+        for name, parameter in inspect.signature(function).parameters.items()
+        if parameter.kind not in (parameter.VAR_KEYWORD, parameter.VAR_POSITIONAL)
+        and parameter.default is parameter.empty
+        and name not in data
+    ]
 
 
 def split_static(data: Data) -> tuple[dict[str, Any], dict[str, Any]]:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterable
 from pathlib import Path
 
 from dtprob.errors import InputError, nearest
-from dtprob.models.arguments import Data, Model
+from dtprob.models.arguments import Data, Model, lacking
 from dtprob.models.indices import check_indices
 
 
@@ -24,10 +23,8 @@ def check_columns(file: Path, model: Model, arguments: Data, columns: Iterable[s
         InputError: a column is missing, or an index in one is beyond an array's end.
     """
     there = list(columns)
-    for name, parameter in inspect.signature(model).parameters.items():
-        is_one = parameter.kind in (parameter.POSITIONAL_OR_KEYWORD, parameter.KEYWORD_ONLY)
-        if is_one and parameter.default is parameter.empty and name not in arguments:
-            close = nearest(name, there)
-            remedy = f"Rename {close!r} there" if close else "Add it, or give it under [model.options]"
-            raise InputError(file.name, f"a column {name!r}", ", ".join(there) or "none", remedy)
+    for name in lacking(model, arguments):
+        close = nearest(name, there)
+        remedy = f"Rename {close!r} there" if close else "Add it, or give it under [model.options]"
+        raise InputError(file.name, f"a column {name!r}", ", ".join(there) or "none", remedy)
     check_indices(model, arguments, f"{file.name}, column")

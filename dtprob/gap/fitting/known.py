@@ -86,15 +86,17 @@ def _skewed(
     base = [b for b in active.blocks if b.owner is None and b.name not in known and not _is_heavy(problem, b)]
     at = np.unique(np.concatenate([b.index.reshape(-1) for b in base])) if base else np.zeros(0, int)
     at = at[alone[at] & (np.abs(slope[at]) > _LEVEL)]
+    at = at[np.abs(curvature[at]) > _FAINT * told[at]]
     middle, spread = (part[at] for part in problem.prior_middle)
-    drawn = np.abs(problem.prior_score(x)[at])
-    score = np.maximum(drawn, _NEAR)
     with np.errstate(divide="ignore", invalid="ignore"):
         here = 1 / np.sqrt(curvature[at])
         centre = x[at] + slope[at] * here**2
         is_normal = np.maximum(np.abs(centre - middle), np.abs(here - spread)) < _ALIKE * spread
-        is_near = np.abs(slope[at]) * here < (1 + _ALIKE) * score
-    wrong = ~is_normal & ~is_near & (drawn < _FARTHEST) & (np.abs(curvature[at]) > _FAINT * told[at])
+    at, here = at[~is_normal], here[~is_normal]
+    drawn = np.abs(problem.prior_score(x, at))
+    score = np.maximum(drawn, _NEAR)
+    is_near = np.abs(slope[at]) * here < (1 + _ALIKE) * score
+    wrong = ~is_near & (drawn < _FARTHEST)
     found[at[wrong]] = (slope[at] / score)[wrong] ** 2
     return found
 

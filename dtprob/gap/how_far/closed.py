@@ -28,9 +28,9 @@ class HeldOut:
     Attributes:
         log_likelihood: held-out log marginal likelihood of each cluster (cluster,), with its part of what the fits cost
             on earlier data.
-        doubt: variance of that cost where nothing has changed since.
         misses: by how much predictions miss each cluster, by observed site and measure.
         estimates: the effects' parameters in each fold, {site name: (fold, *shape flattened)}.
+        doubt: variance of what the fits cost on earlier data, where nothing has changed since.
     """
 
     log_likelihood: np.ndarray
@@ -188,5 +188,5 @@ def _gains(before: HeldOut, after: HeldOut, key: jax.Array, draws: int) -> tuple
     """Gain of each cluster, and its totals over bootstrap draws of the clusters and of what earlier data say by chance."""
     gain = after.log_likelihood - before.log_likelihood
     index = np.asarray(jax.random.randint(key, (draws, len(gain)), 0, len(gain)))
-    chance = np.sqrt(max(before.doubt - after.doubt, 0.0)) * np.asarray(jax.random.normal(key, (draws,)))
-    return gain, gain[index].sum(1) + chance
+    chance = np.asarray(jax.random.normal(jax.random.fold_in(key, 2), (draws,)))
+    return gain, gain[index].sum(1) + np.sqrt(max(before.doubt - after.doubt, 0.0)) * chance

@@ -68,12 +68,14 @@ def _check_slope(effect: Effect, values: Mapping[str, jax.Array], context: Conte
     if not all(np.isfinite(slope).all() for slope in slopes):
         remedy = "Keep the rewrite smooth there; see where a root or an absolute value acts on a parameter"
         raise InputError(what, "a finite derivative at its null", "inf or nan", remedy)
+    if any(slope.any() for slope in slopes):
+        return
     moved = {name: jnp.asarray(value) + 1.0 for name, value in effect.null().items()}
     after = (rewritten(effect, site, values[site], moved, context) for site in effect.rewrites)
     acts = any(
         (np.asarray(a) != np.asarray(values[s])).any() for a, s in zip(after, effect.rewrites, strict=True)
     )
-    if acts and not any(slope.any() for slope in slopes):
+    if acts:
         remedy = (
             "Let the size enter by its first power (p['b'] for p['b'] ** 2), and name a place with is_place"
         )

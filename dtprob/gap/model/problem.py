@@ -362,11 +362,9 @@ class Problem:
         low, middle, high = (self._prior_quantiles[_SCORES.index(s)] for s in (-_TENTH, 0.0, _TENTH))
         return middle, (high - low) / (2 * _TENTH)
 
-    def prior_score(self, x: np.ndarray) -> np.ndarray:
-        """Normal scores among prior draws, at most 3 from 0, of the base model's coordinates, which are a point's first."""
-        count = sum(block.index.size for block in self.blocks_of(None))
-        values = self._prior_quantiles[:, :count].T
-        return np.array([np.interp(x[i], own, _SCORES) for i, own in enumerate(values)])
+    def prior_score(self, x: np.ndarray, index: np.ndarray) -> np.ndarray:
+        """Normal scores among prior draws, at most 3 from 0, of some coordinates of a point, all of the base model."""
+        return np.array([np.interp(x[i], self._prior_quantiles[:, i], _SCORES) for i in index])
 
     @cached_property
     def usual(self) -> dict[str, tuple[float, float]]:
