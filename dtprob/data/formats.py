@@ -146,7 +146,7 @@ def _read_csv(path: Path) -> Arrays:
         raise InputError(str(path), "a name for each column", got, remedy)
     names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
     unnamed = [name for name in names if name not in header]
-    table = pd.read_csv(path, header=0, names=names, index_col=False, usecols=range(len(names)))
+    table = pd.read_csv(path, header=0, names=names, usecols=range(len(names)))
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
 
 
