@@ -10,8 +10,6 @@ import jax
 
 LARGEST: Final = 1 << 30
 """Bytes that the folder may hold at the start of a command; the oldest programs go first."""
-_WORTH_KEEPING: Final = 0.05
-"""Seconds of compilation from which a program is kept: reading one back takes a tenth of that."""
 
 
 def keep_compiled() -> None:
@@ -21,7 +19,7 @@ def keep_compiled() -> None:
     folder = cache_folder()
     prune(folder, LARGEST)
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update("jax_persistent_cache_min_compile_time_secs", _WORTH_KEEPING)
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)  # reading one back takes a tenth of that
 
 
 def cache_folder() -> Path:

@@ -12,19 +12,16 @@ import numpy as np
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.terms import in_user_terms
+from dtprob.gap.located import along, unlisted, where
 from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.locate import Location, SiteFinding
-from dtprob.gap.where.reach import touched
+from dtprob.gap.where.closed_share import closed_shares
+from dtprob.gap.where.locate import SiteFinding
 from dtprob.gap.which.screen import Screening
 from dtprob.gap.which.trials import credit
 from dtprob.inference.engine import AbstractEngine
 
 _DRAWS = 200
-_TOLD = 0.01
-"""Probability up to which a site comes before those that have no more than a larger share."""
-_LEAST_GAP = 1.0
-"""Nats of a gap of which a site can have a share."""
 _MOST_ALIKE = 300
 """Candidates up to which a report tells how much each looks like each."""
 
@@ -40,9 +37,10 @@ def compose(
 ) -> Diagnosis:
     """The diagnosis with all sections of the report."""
     first = evidence.steps[0].view.screening
+    told_along = along(evidence)
     sections: dict[str, Any] = {
         "tried": _tried(evidence),
-        "where": _where(evidence),
+        "where": where(evidence, told_along),
         "gap": _gap(evidence),
         "unlisted": unlisted(evidence.after, settings.level / 2),
         "remainder": _remainder(evidence),
@@ -60,7 +58,8 @@ def compose(
             **_alike(first),
         },
     }
-    return Diagnosis(verdict, summary(verdict, causes, evidence), causes, sections, maps(evidence))
+    arrays = maps(evidence, closed_shares(told_along))
+    return Diagnosis(verdict, summary(verdict, causes, evidence), causes, sections, arrays)
 
 
 def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
@@ -131,64 +130,6 @@ def _tried(evidence: Evidence) -> list[dict[str, Any]]:
         }
         for names in sorted(fits, key=lambda names: (names != evidence.accepted, -worth[names]))
     ]
-
-
-def unlisted(after: Location, level: float) -> dict[str, Any]:
-    """What is left over at the last fit: the sites at which it is, and how each of them is wrong."""
-    left = [found for found in after.sites if found.p_value <= level]
-    return {
-        "p_value": after.site_p_value,
-        "sites": list(dict.fromkeys(found.site for found in left)),
-        "located": [_located(found, None) for found in left],
-    }
-
-
-def site_shares(found: Sequence[SiteFinding], gap: float, closed: Mapping[str, float]) -> list[float | None]:
-    """The share of the gap that changing each site closes; None where there is no gap to share, or nothing to change.
-
-    Args:
-        found: the sites.
-        gap: nats between the twin and the best that is known.
-        closed: what the named effects close, for each site that they change.
-    """
-    return [
-        max(min(one.gain / gap, 1.0), closed.get(one.site, 0.0))
-        if one.gain is not None and gap >= _LEAST_GAP
-        else None
-        for one in found
-    ]
-
-
-def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, float, float]:
-    """Values by their shares, moments by their p-values."""
-    found, share = one
-    return found.last, found.p_value > _TOLD, -(share or 0.0) * (found.moment is None), found.p_value
-
-
-def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:
-    return {"site": found.site, "p_value": found.p_value, "share": share, "family": found.family}
-
-
-def _where(evidence: Evidence) -> dict[str, Any]:
-    gap = evidence.floor.best - float(evidence.held_before.log_likelihood.sum())
-    coordinates = touched(evidence.steps[0].view, evidence.last)
-    excess = sum(c.excess for c in coordinates) or 1.0
-    accepted = [e for e in evidence.problem.effects if e.name in evidence.accepted]
-    share = evidence.fraction.mean if evidence.fraction is not None else 0.0
-    closed = {site: share for effect in accepted for site in effect.sites}
-    before = evidence.before.sites
-    sites = zip(before, site_shares(before, gap, closed), strict=True)
-    return {
-        "sites": [_located(*one) for one in sorted(sites, key=_rank)],
-        "coordinates": [
-            {
-                "axes": {c.axis: [c.low, c.high]},
-                "p_value": c.p_value,
-                "share": max(c.excess, 0.0) / max(excess, c.excess),
-            }
-            for c in coordinates
-        ],
-    }
 
 
 def _gap(evidence: Evidence) -> dict[str, Any]:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import xarray as xr
 
 from dtprob.gap.evidence import Evidence
+from dtprob.gap.where.closed_share import ClosedShare
 
 _PATHS = "path_gain"
 """The site that has an entry for each path."""
@@ -17,10 +19,18 @@ _MOST_STEPS = 200_000
 """Steps of paths beyond which a scene is not drawn."""
 
 
-def maps(evidence: Evidence) -> dict[str, xr.Dataset]:
-    """Groups of gap.nc: excess along each axis, loss of each cluster, the screening, and paths where there are any."""
-    where = {f"gap_{axis}": (axis, values) for axis, values in evidence.before.axes.items()}
+def maps(evidence: Evidence, closed: Mapping[str, ClosedShare]) -> dict[str, xr.Dataset]:
+    """Groups of gap.nc: excess along each axis, loss of each cluster, the screening, and paths where there are any.
+
+    Args:
+        evidence: of the diagnosis.
+        closed: how what the causes close is spread along each axis.
+    """
+    where: dict[str, Any] = {f"gap_{axis}": (axis, values) for axis, values in evidence.before.axes.items()}
     after = {f"gap_after_{axis}": (axis, values) for axis, values in evidence.after.axes.items()}
+    for axis, share in closed.items():
+        where[f"closed_{axis}"] = (axis, share.found, {"nats": share.total})
+        where[f"closed_expected_{axis}"] = (axis, share.expected)
     problem, name = evidence.problem, evidence.problem.cluster_name
     per = (
         np.maximum((problem.rows.by_cluster(problem.rows.located) >= 0).sum(1), 1)

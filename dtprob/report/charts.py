@@ -1,37 +1,18 @@
 """The figures of one report's page, each with a caption and a description for those who cannot see it."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 import xarray as xr
-from markupsafe import Markup
 
-from dtprob.report.figures import (
-    IntervalRow,
-    classes_for,
-    coordinate_map,
-    gap_track,
-    interval_plot,
-    plan_view,
-    usual_limit,
-)
+from dtprob.report.axis_charts import closed_charts, coordinate_charts, difference_charts
+from dtprob.report.chart import Chart, group
+from dtprob.report.figures import IntervalRow, classes_for, gap_track, interval_plot, plan_view
 from dtprob.report.json_schema import Interval, Report
 from dtprob.report.names import capital, listing, together, words
 from dtprob.report.scene_view import Scene, scene, scene_view
 from dtprob.report.svg import inline_svg
-from dtprob.report.units import number, scale_for
-
-_BEFORE, _AFTER = "gap_", "gap_after_"
-_MOST_MAPS = 6
-
-
-@dataclass(frozen=True)
-class Chart:
-    """One figure of the page."""
-
-    svg: Markup
-    caption: str
+from dtprob.report.units import number
 
 
 def gap_chart(report: Report) -> Chart | None:
@@ -96,47 +77,9 @@ def _in_percent(closed: Interval | None) -> tuple[float, float, float] | None:
     return 100 * closed["mean"], 100 * closed["low"], 100 * closed["high"]
 
 
-def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
-    """A map of the gap over each axis that gap.nc holds, those that the report names first."""
-    data = _group(gap, "where", report)
-    named = [axis for entry in report["where"]["coordinates"] for axis in entry["axes"]]
-    axes = [name[len(_BEFORE) :] for name in map(str, data) if _is_before(name) and data[name].count() > 1]
-    ordered = sorted(axes, key=lambda axis: named.index(axis) if axis in named else len(named))
-    quiet = report["verdict"] == "NO_GAP"
-    return [_coordinate_chart(data, axis, quiet=quiet, named=axis in named) for axis in ordered[:_MOST_MAPS]]
-
-
-def difference_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
-    """Data less twin along each column of the data, in their own unit, with its sign."""
-    data = _group(gap, "differences", report)
-    return [_difference_chart(data, i) for i in range(len(data.dims))]
-
-
-def _difference_chart(data: xr.Dataset, index: int) -> Chart:
-    place, before, spread = (data[f"{name}_{index}"].values for name in ("place", "before", "spread"))
-    after, said = data.get(f"after_{index}"), data[f"place_{index}"].attrs
-    name, unit = capital(words(str(said["column"]))), said["unit"]
-    limit = usual_limit(int(said["of"])) * spread
-    figure = coordinate_map(
-        place,
-        before,
-        None if after is None else after.values,
-        label=name,
-        threshold=limit,
-        amount=f"Data less twin ({unit})" if unit else "Data less twin",
-    )
-    far = int(np.argmax(np.abs(before) - limit))
-    caption = (
-        f"{name}: above 0 the data ({words(str(said['observed']))}) are larger than the twin says, on average. "
-        "Grey: where all values along all columns stay, in 95 of 100 cases, when the twin is right."
-    )
-    most = f"{number(float(before[far]))} at {number(float(place[far]))}"
-    return Chart(inline_svg(figure, f"Data less twin along {words(str(said['column']))}: {most}."), caption)
-
-
 def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     """The links seen from above, before and after, in the same colours."""
-    data = _group(gap, "links", report)
+    data = group(gap, "links", report)
     if not {"rx_position", "tx_position", "before"} <= set(data):
         return []
     data = data.dropna(str(data["before"].dims[0]))
@@ -196,68 +139,6 @@ _DOTS = "Dots are receivers, triangles transmitters. The larger and stronger a d
 _WHEN = {"before": "The twin as it is", "after": "With the cause added"}
 
 
-def _is_before(name: str) -> bool:
-    return name.startswith(_BEFORE) and not name.startswith(_AFTER)
-
-
-def _group(gap: xr.DataTree | None, name: str, report: Report) -> xr.Dataset:
-    """A group of gap.nc, infinite values as missing; nothing "after" without an accepted cause."""
-    if gap is None or name not in gap.children:
-        return xr.Dataset()
-    dataset = gap[name].to_dataset()
-    accepted = report["gap"]["after"] is not None
-    kept = [key for key in map(str, dataset.data_vars) if accepted or "after" not in key.split("_")]
-    return dataset[kept].where(np.abs(dataset[kept]) < np.inf)
-
-
-def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) -> Chart:
-    complete = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]].dropna(axis)
-    before, after = complete[_BEFORE + axis], complete.get(_AFTER + axis)
-    place, unit = _places(before, axis)
-    name, limit = capital(words(axis)), before.attrs.get("threshold") or usual_limit(before.size)
-    figure = coordinate_map(
-        place,
-        before.values,
-        None if after is None else after.values,
-        label=f"{name} ({unit})" if unit else name,
-        threshold=limit,
-    )
-    told = f"Gap over {words(axis)}: {_peak(before.values, place, 'before')}"
-    if after is not None:
-        told += f"; {_peak(after.values, place, 'after')}"
-    caption = (
-        f"{name}: how much more the data stray from the twin than they should. "
-        "Grey: where all values stay, in 95 of 100 cases, when the twin is right."
-    )
-    unseen = data.sizes[axis] - complete.sizes[axis]
-    if unseen:
-        caption += f" {unseen} not shown: nothing was observed there."
-    outside = bool((np.abs(before) > limit).any())
-    if quiet and outside:
-        caption += " One such figure in twenty has a value outside by chance."
-    if not (quiet or named or outside):
-        caption += f" No {words(axis)} stands out alone: the gap is a pattern across them."
-    return Chart(inline_svg(figure, f"{told}."), caption)
-
-
-def _places(values: xr.DataArray, axis: str) -> tuple[np.ndarray, str]:
-    """Coordinates in human units; without coordinates, their number."""
-    if axis not in values.coords:
-        return np.arange(values.size), ""
-    coordinate = values.coords[axis]
-    unit = str(coordinate.attrs.get("units", ""))
-    if not unit or not np.issubdtype(coordinate.dtype, np.number):
-        return coordinate.values, unit
-    scale = scale_for([float(np.abs(coordinate.values).max())], unit)
-    return coordinate.values * scale.factor, scale.unit
-
-
-def _peak(values: np.ndarray, place: np.ndarray, name: str) -> str:
-    top = int(np.argmax(values))
-    where = number(float(place[top])) if np.issubdtype(place.dtype, np.number) else str(place[top])
-    return f"{name}, the highest excess is {number(float(values[top]))} standard deviations at {where}"
-
-
 def _plan_alt(value: xr.DataArray, rx_position: np.ndarray, name: str) -> str:
     worst = int(np.argmax(value.values))
     x, y = rx_position[worst, :2]
@@ -271,6 +152,7 @@ def _plan_alt(value: xr.DataArray, rx_position: np.ndarray, name: str) -> str:
 def all_charts(report: Report, gap: xr.DataTree | None) -> Iterator[tuple[str, Chart]]:
     """Every figure of the page with the section it belongs to."""
     yield from (("coordinates", chart) for chart in coordinate_charts(report, gap))
+    yield from (("closed", chart) for chart in closed_charts(report, gap))
     yield from (("differences", chart) for chart in difference_charts(report, gap))
     if report["verdict"] == "NO_GAP":  # bars and colours would make noise look like a finding
         return

@@ -1,4 +1,4 @@
-"""Figures of reports: an interval plot, a map over a coordinate, a plan view, a gap track.
+"""Figures of reports: an interval plot, a plan view, a gap track.
 
 Each function returns a `matplotlib.figure.Figure` of its own, drawn without pyplot and without touching
 global settings. They are 5 inches wide, so that their letters stay legible on a telephone.
@@ -15,7 +15,6 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 from numpy.typing import ArrayLike
-from scipy.stats import norm
 
 from dtprob.report.palette import LIGHT, RAMP
 from dtprob.report.units import decimals_for, number
@@ -144,63 +143,6 @@ def gap_track(before: float, after: float | None, floor: tuple[float, float] | N
         return figure
 
 
-def usual_limit(count: int) -> float:
-    """Within which all of so many independent normal values stay in 95 of 100 cases."""
-    return float(norm.ppf(1 - 0.025 / max(count, 1)))
-
-
-def coordinate_map(
-    coordinate: ArrayLike,
-    before: ArrayLike,
-    after: ArrayLike | None = None,
-    *,
-    label: str,
-    threshold: float | Float[np.ndarray, " coordinate"],
-    amount: str = "Excess (std. dev.)",
-) -> Figure:
-    """A misfit over one coordinate of the data, before and after the accepted effect.
-
-    Args:
-        coordinate: (coordinate,) numbers, or names.
-        before: (coordinate,) misfit of the twin as it is.
-        after: (coordinate,) the same with the accepted effect.
-        label: name and unit of the coordinate.
-        threshold: all values stay within +-threshold in 95 of 100 data sets when the twin is right; see `usual_limit`.
-        amount: what is drawn, with its unit.
-    """
-    names = np.asarray(coordinate)
-    place = names if np.issubdtype(names.dtype, np.number) else np.arange(names.size)
-    with mpl.rc_context(STYLE):
-        figure, axes = _figure(2.7)
-        if isinstance(threshold, np.ndarray):
-            axes.fill_between(place, -threshold, threshold, color=LIGHT["floor"], linewidth=0)
-        else:
-            axes.axhspan(-threshold, threshold, color=LIGHT["floor"], linewidth=0)
-        marker = names.size <= 48
-        for value, name, shape in ((before, "before", "s"), (after, "after", "o")):
-            if value is not None:
-                values = np.asarray(value, dtype=float)
-                style = shape if marker else ""
-                axes.plot(
-                    place, values, f"{style}-", color=LIGHT[name], markersize=4.5, linewidth=1.3, label=name
-                )
-        if place is not names:
-            axes.set_xticks(place, [str(name) for name in names], rotation=0 if names.size <= 6 else 45)
-        elif names.size <= 10:
-            axes.set_xticks(place)
-        axes.yaxis.set_major_locator(MaxNLocator(5))
-        limit = float(np.max(threshold))
-        if max(np.max(np.abs(np.asarray(before))), limit) > 40 * limit:
-            axes.set_yscale("symlog", linthresh=limit)
-        if after is not None:
-            axes.legend(
-                loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=2, labelcolor="linecolor", borderpad=0
-            )
-        axes.set_xlabel(label)
-        axes.set_ylabel(amount)
-        return figure
-
-
 def plan_view(
     rx_position: Float[np.ndarray, "link 3"],
     tx_position: Float[np.ndarray, "link 3"],
@@ -226,7 +168,7 @@ def plan_view(
     corners = np.concatenate([receivers, transmitters])[:, :2]
     extent = np.maximum(np.ptp(corners, axis=0), 1e-3)
     with mpl.rc_context(STYLE):
-        figure, axes = _figure(float(np.clip(WIDTH * 0.86 * extent[1] / extent[0], 1.4, 4.4)) + 1.0)
+        figure, axes = plain_figure(float(np.clip(WIDTH * 0.86 * extent[1] / extent[0], 1.4, 4.4)) + 1.0)
         for index in range(len(classes.colours)):
             chosen = receivers[rank == index]
             size = 16 + 7 * index
@@ -247,7 +189,8 @@ def plan_view(
         return figure
 
 
-def _figure(height: float) -> tuple[Figure, Axes]:
+def plain_figure(height: float) -> tuple[Figure, Axes]:
+    """An empty figure of a page's width, `height` inches high."""
     figure = Figure(figsize=(WIDTH, height), layout="constrained")
     return figure, figure.subplots()
 
@@ -258,7 +201,7 @@ def _beside(axes: Axes, x: float, y: float, text: str) -> None:
 
 def _rows(names: Sequence[str], height: float) -> tuple[Figure, Axes]:
     """Axes with a row for each name, whose name stands at the left above the row's place."""
-    figure, axes = _figure(0.65 + height * len(names))
+    figure, axes = plain_figure(0.65 + height * len(names))
     for place, name in enumerate(names):
         axes.annotate(
             name, (0, place), (0, 9.5), ("axes fraction", "data"), "offset points", va="baseline", size=10.5

@@ -7,7 +7,7 @@ causes and r the projected residuals of the base fit. Where nothing is closed u 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -21,7 +21,6 @@ from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.refit import at_null_except
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
-from dtprob.gap.view import View
 from dtprob.gap.where.coordinates import CoordinateFinding
 
 _HELD: Final = 0.9
@@ -29,6 +28,13 @@ _HELD: Final = 0.9
 _LOCAL: Final = 0.5
 """Share of an axis's positions up to which a cause is at some place of it, and not everywhere."""
 _LEVEL: Final = 0.01
+
+
+class Told(NamedTuple):
+    """What each position (position,) of an axis tells of the causes: <delta, r> and <delta, delta>."""
+
+    product: Float[np.ndarray, " position"]
+    energy: Float[np.ndarray, " position"]
 
 
 class _Block(NamedTuple):
@@ -45,30 +51,13 @@ class _Block(NamedTuple):
         """Standard normal where the causes do nothing."""
         return self.product / np.sqrt(self.energy)
 
-    @property
-    def gain(self) -> float:
-        """Nats that the best size of what the causes do here would gain."""
-        return self.z**2 / 2
+    def found(self, p_value: float) -> CoordinateFinding:
+        """The block with the nats that the best size of what the causes do here would gain, if they do it at all."""
+        return CoordinateFinding(self.axis, self.low, self.high, p_value, max(self.z, 0.0) ** 2 / 2)
 
 
-def touched(before: View, after: View) -> tuple[CoordinateFinding, ...]:
-    """The blocks that the accepted causes reach, and on all other axes those whose misfit stands out at the base fit.
-
-    Args:
-        before: the base fit.
-        after: the fit with the accepted effects.
-    """
-    found = reach(before.problem, before.fitted, before.projection, after.problem, after.fitted)
-    axes = {block.axis for block in found}
-    return (*found, *(block for block in before.location.coordinates if block.axis not in axes))
-
-
-def reach(
-    problem: Problem, base: Fit, projection: Projection, wider: Problem, fitted: Fit
-) -> tuple[CoordinateFinding, ...]:
-    """Blocks of every axis that hold what mean effects close, family-wise at 1%; none of an axis they fill.
-
-    Source: Holm 1979 for the step-down p-values.
+def told(problem: Problem, base: Fit, projection: Projection, wider: Problem, fitted: Fit) -> dict[str, Told]:
+    """What each position of every axis tells of mean effects; nothing where they shift nothing.
 
     Args:
         problem: the model.
@@ -77,30 +66,52 @@ def reach(
         wider: the model with effects live.
         fitted: its fit with some of them; random fields among these are left out.
     """
-    delta, rows = _shift(problem, base, wider, fitted), problem.rows
-    _, projected = observed_rows(problem, base, projection)
-    delta = np.where(rows.by_cluster(rows.located) == 1, delta, 0.0)
+    rows = problem.rows
+    delta = np.where(rows.by_cluster(rows.located) == 1, _shift(problem, base, wider, fitted), 0.0)
     if not np.isfinite(delta).all() or not (delta**2).any():
-        return ()
-    blocks: list[_Block] = []
+        return {}
+    _, projected = observed_rows(problem, base, projection)
+    found = {}
     for axis, position in rows.coordinates.items():
         index = rows.by_cluster(position)
         keep = index >= 0
-        energy = np.bincount(index[keep], weights=delta[keep] ** 2)
         product = np.bincount(index[keep], weights=(delta * projected)[keep])
-        for low, high in _held(energy, together=axis != problem.declaration.cluster):
-            place = slice(low, high + 1)
-            blocks.append(_Block(axis, low, high, float(product[place].sum()), float(energy[place].sum())))
+        found[axis] = Told(product, np.bincount(index[keep], weights=delta[keep] ** 2))
+    return found
+
+
+def reached(along: Mapping[str, Told], unordered: str | None) -> tuple[CoordinateFinding, ...]:
+    """Blocks of every axis that hold what mean effects close, family-wise at 1%; none of an axis they fill.
+
+    Each block is told on its own as far as that goes (Holm 1979). The others of an axis, too weak alone, are told together:
+    all of them where what they hold in sum is no chance, with its p-value.
+
+    Args:
+        along: what each position tells, by axis.
+        unordered: the axis of clusters, whose neighbours make no block.
+    """
+    blocks = [
+        _Block(axis, low, high, *(float(part[low : high + 1].sum()) for part in here))
+        for axis, here in along.items()
+        for low, high in _held(here.energy, together=axis != unordered)
+    ]
     blocks.sort(key=lambda block: -block.z)
     step_down = np.maximum.accumulate(
         [float(stats.norm.sf(block.z)) * (len(blocks) - k) for k, block in enumerate(blocks)]
     )
-    found = [
-        CoordinateFinding(b.axis, b.low, b.high, float(p), b.gain)
-        for b, p in zip(blocks, step_down, strict=True)
-        if p < _LEVEL
-    ]
+    found = [block.found(float(p)) for block, p in zip(blocks, step_down, strict=True) if p < _LEVEL]
+    weak = blocks[len(found) :]
+    for axis in along:
+        rest = [block for block in weak if block.axis == axis]
+        if len(rest) > 1 and (p := _together(rest) * len(along)) < _LEVEL:
+            found += [block.found(p) for block in rest]
     return tuple(sorted(found, key=lambda b: -b.excess))
+
+
+def _together(blocks: list[_Block]) -> float:
+    """Chance that blocks hold as much in sum where the causes do nothing."""
+    product, energy = sum(b.product for b in blocks), sum(b.energy for b in blocks)
+    return float(stats.norm.sf(product / np.sqrt(energy)))
 
 
 def _held(energy: Float[np.ndarray, " position"], *, together: bool) -> Iterator[tuple[int, int]]:

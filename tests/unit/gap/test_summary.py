@@ -4,7 +4,8 @@ from types import SimpleNamespace
 
 import pytest
 
-from dtprob.gap.compose import site_shares, summary, unlisted
+from dtprob.gap.compose import summary
+from dtprob.gap.located import site_shares, unlisted
 from dtprob.gap.where.locate import Location, SiteFinding
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dtprob.report.charts import coordinate_charts
+from dtprob.report.axis_charts import closed_charts, coordinate_charts
 
 
 def caption(verdict: str, excess: list[float], *, named: bool = False) -> str:
@@ -33,3 +33,33 @@ def test_a_value_outside_is_chance_where_nothing_is_found() -> None:
 def test_what_was_not_observed_is_said() -> None:
     assert "2 not shown: nothing was observed there." in caption("NO_GAP", [0.0, np.nan, 1.0, np.nan])
     assert "not shown" not in caption("NO_GAP", [0.0, 1.0])
+
+
+def closed(found: list[float], expected: list[float], nats: float) -> str:
+    """What the only map of shares says."""
+    report: Any = {"causes": [{}], "gap": {"after": 0.0}}
+    shares = {
+        "closed_link": ("link", np.array(found), {"nats": nats}),
+        "closed_expected_link": ("link", np.array(expected)),
+    }
+    (chart,) = closed_charts(report, xr.DataTree.from_dict({"where": xr.Dataset(shares)}))
+    return chart.caption
+
+
+def test_a_cause_that_closes_the_gap_elsewhere_than_it_should_is_told() -> None:
+    assert "something else" not in closed([0.75, 0.15, 0.1], [0.7, 0.2, 0.1], 50.0)
+    assert "something else" in closed([0.1, 0.15, 0.75], [0.7, 0.2, 0.1], 50.0)
+    assert "something else" not in closed([0.1, 0.15, 0.75], [0.7, 0.2, 0.1], 2.0)
+
+
+def test_long_axes_are_drawn_in_groups() -> None:
+    """A thousand positions that each stray as chance allows, and far more than their own share."""
+    rng = np.random.default_rng(0)
+    expected = np.full(1000, 1e-3)
+    found = expected + np.sqrt(2 * expected / 100) * rng.normal(size=1000)
+    assert "something else" not in closed(list(found / found.sum()), list(expected), 100.0)
+
+
+def test_no_map_of_shares_without_a_cause() -> None:
+    report: Any = {"causes": [], "gap": {"after": None}}
+    assert closed_charts(report, None) == []

@@ -8,15 +8,14 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
+from dtprob.report.axis_figures import coordinate_map, share_map, usual_limit
 from dtprob.report.figures import (
     WIDTH,
     IntervalRow,
     classes_for,
-    coordinate_map,
     gap_track,
     interval_plot,
     plan_view,
-    usual_limit,
 )
 from dtprob.report.palette import DARK, LIGHT, contrast
 from dtprob.report.svg import inline_svg
@@ -33,6 +32,7 @@ def _figures() -> dict[str, Figure]:
         "interval": interval_plot(rows, label="size (m)", null=0.0),
         "gap": gap_track(1.2, 0.1, (0.02, 0.08), unit="nats"),
         "gap without floor": gap_track(-350.2, -360.1, None, unit="nats"),
+        "shares": share_map(np.arange(3), value[:3], value[1:4], np.ones(3), label="link"),
         "map": coordinate_map(np.arange(30), value, 0.1 * value, label="antenna", threshold=usual_limit(30)),
         "names": coordinate_map(["a", "b", "c"], [1.0, 2.0, 900.0], label="object", threshold=usual_limit(3)),
         "plan": plan_view(position, position[:2], value, classes=classes, label="excess (nats)"),

@@ -7,7 +7,7 @@ import pytest
 from scipy import stats
 
 from dtprob.gap.where.coordinates import scan_coordinates
-from dtprob.report.figures import usual_limit
+from dtprob.report.axis_figures import usual_limit
 
 
 def scanned(observed, null, *, outcomes=False):

@@ -16,7 +16,7 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.where.differences import differences
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
-from dtprob.report.charts import difference_charts
+from dtprob.report.axis_charts import difference_charts
 
 ROWS, GROUPS, SIGMA = 240, 24, 2.0
 RNG = np.random.default_rng(5)

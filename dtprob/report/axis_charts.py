@@ -1,0 +1,146 @@
+"""The figures of a page over the data's coordinates: the gap, data against the twin, and what a cause closes where."""
+
+import numpy as np
+import xarray as xr
+
+from dtprob.report.axis_figures import coordinate_map, share_map, usual_limit
+from dtprob.report.chart import Chart, group
+from dtprob.report.json_schema import Report
+from dtprob.report.names import capital, words
+from dtprob.report.svg import inline_svg
+from dtprob.report.units import number, scale_for
+
+_BEFORE, _AFTER = "gap_", "gap_after_"
+_FOUND, _EXPECTED = "closed_", "closed_expected_"
+_MOST_MAPS = 6
+_MOST_SHARES = 4
+_GROUPS = 24
+"""Positions of which shares are drawn apart; of longer axes so many groups of neighbours."""
+
+
+def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
+    """A map of the gap over each axis that gap.nc holds, those that the report names first."""
+    data = group(gap, "where", report)
+    named = [axis for entry in report["where"]["coordinates"] for axis in entry["axes"]]
+    axes = [name[len(_BEFORE) :] for name in map(str, data) if _is_before(name) and data[name].count() > 1]
+    ordered = sorted(axes, key=lambda axis: named.index(axis) if axis in named else len(named))
+    quiet = report["verdict"] == "NO_GAP"
+    return [_coordinate_chart(data, axis, quiet=quiet, named=axis in named) for axis in ordered[:_MOST_MAPS]]
+
+
+def difference_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
+    """Data less twin along each column of the data, in their own unit, with its sign."""
+    data = group(gap, "differences", report)
+    return [_difference_chart(data, i) for i in range(len(data.dims))]
+
+
+def _difference_chart(data: xr.Dataset, index: int) -> Chart:
+    place, before, spread = (data[f"{name}_{index}"].values for name in ("place", "before", "spread"))
+    after, said = data.get(f"after_{index}"), data[f"place_{index}"].attrs
+    name, unit = capital(words(str(said["column"]))), said["unit"]
+    limit = usual_limit(int(said["of"])) * spread
+    figure = coordinate_map(
+        place,
+        before,
+        None if after is None else after.values,
+        label=name,
+        threshold=limit,
+        amount=f"Data less twin ({unit})" if unit else "Data less twin",
+    )
+    far = int(np.argmax(np.abs(before) - limit))
+    caption = (
+        f"{name}: above 0 the data ({words(str(said['observed']))}) are larger than the twin says, on average. "
+        "Grey: where all values along all columns stay, in 95 of 100 cases, when the twin is right."
+    )
+    most = f"{number(float(before[far]))} at {number(float(place[far]))}"
+    return Chart(inline_svg(figure, f"Data less twin along {words(str(said['column']))}: {most}."), caption)
+
+
+def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) -> Chart:
+    complete = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]].dropna(axis)
+    before, after = complete[_BEFORE + axis], complete.get(_AFTER + axis)
+    place, unit = _places(before, axis)
+    name, limit = capital(words(axis)), before.attrs.get("threshold") or usual_limit(before.size)
+    figure = coordinate_map(
+        place,
+        before.values,
+        None if after is None else after.values,
+        label=f"{name} ({unit})" if unit else name,
+        threshold=limit,
+    )
+    told = f"Gap over {words(axis)}: {_peak(before.values, place, 'before')}"
+    if after is not None:
+        told += f"; {_peak(after.values, place, 'after')}"
+    caption = (
+        f"{name}: how much more the data stray from the twin than they should. "
+        "Grey: where all values stay, in 95 of 100 cases, when the twin is right."
+    )
+    unseen = data.sizes[axis] - complete.sizes[axis]
+    if unseen:
+        caption += f" {unseen} not shown: nothing was observed there."
+    outside = bool((np.abs(before) > limit).any())
+    if quiet and outside:
+        caption += " One such figure in twenty has a value outside by chance."
+    if not (quiet or named or outside):
+        caption += f" No {words(axis)} stands out alone: the gap is a pattern across them."
+    return Chart(inline_svg(figure, f"{told}."), caption)
+
+
+def _places(values: xr.DataArray, axis: str) -> tuple[np.ndarray, str]:
+    """Coordinates in human units; without coordinates, their number."""
+    if axis not in values.coords:
+        return np.arange(values.size), ""
+    coordinate = values.coords[axis]
+    unit = str(coordinate.attrs.get("units", ""))
+    if not unit or not np.issubdtype(coordinate.dtype, np.number):
+        return coordinate.values, unit
+    scale = scale_for([float(np.abs(coordinate.values).max())], unit)
+    return coordinate.values * scale.factor, scale.unit
+
+
+def _peak(values: np.ndarray, place: np.ndarray, name: str) -> str:
+    top = int(np.argmax(values))
+    where = number(float(place[top])) if np.issubdtype(place.dtype, np.number) else str(place[top])
+    return f"{name}, the highest excess is {number(float(values[top]))} standard deviations at {where}"
+
+
+def _is_before(name: str) -> bool:
+    return name.startswith(_BEFORE) and not name.startswith(_AFTER)
+
+
+def closed_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
+    """How what the causes close is spread along the data's axes, those along which it is spread least evenly."""
+    data = group(gap, "where", report)
+    if not report["causes"]:
+        return []
+    axes = [name[len(_EXPECTED) :] for name in map(str, data) if name.startswith(_EXPECTED)]
+    uneven = {axis: float(data[_EXPECTED + axis].max()) * data.sizes[axis] for axis in axes}
+    return [_closed_chart(data, axis) for axis in sorted(axes, key=lambda a: -uneven[a])[:_MOST_SHARES]]
+
+
+def _closed_chart(data: xr.Dataset, axis: str) -> Chart:
+    place, unit = _places(data[_FOUND + axis], axis)
+    if not np.issubdtype(place.dtype, np.number):
+        place = np.arange(place.size)
+    parts = np.array_split(np.arange(place.size), min(place.size, _GROUPS))
+    middle = np.array([place[part].mean() for part in parts])
+    found, expected = (
+        np.array([100 * data[name + axis].values[part].sum() for part in parts])
+        for name in (_FOUND, _EXPECTED)
+    )
+    spread = np.sqrt(2 * np.maximum(expected, 0) / 100 / float(data[_FOUND + axis].attrs["nats"]))
+    reach = 100 * usual_limit(len(parts)) * spread
+    name, far = capital(words(axis)), np.abs(found - expected) > reach
+    figure = share_map(middle, found, expected, reach, label=f"{name} ({unit})" if unit else name)
+    most = int(np.argmax(expected))
+    told = (
+        f"What the cause closes over {words(axis)}: most at {number(float(middle[most]))}, where it should be "
+        f"{expected[most]:.0f}% and is {found[most]:.0f}%."
+    )
+    caption = (
+        f"{name}: how what the cause closes is spread. Grey: where all dots lie, in 95 of 100 cases, when the cause acts "
+        "as it is said to."
+    )
+    if far.any():
+        caption += " Dots outside: there the cause does not do what it should, and something else may stand behind it."
+    return Chart(inline_svg(figure, told), caption)
