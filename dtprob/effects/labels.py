@@ -2,44 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro.distributions as dist
 from jaxtyping import Array, Float
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
-from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.label_regions import Region, Weight, regions, slopes
 
-_FEATURES: Final = 16
-"""Features, the first ones, whose regions are looked at."""
 _POINTS: Final = 64
 """Points at which the errors of an old map are drawn."""
 _JITTER: Final = 1e-6
 _REACH: Final = 1.0
 """Distance, in standard deviations of the features, at which the errors of an old map have forgotten one another."""
-_EDGE: Final = 0.05
-"""Standard deviation of where a region's edge lies, as a share of the samples."""
-_SOFT: Final = 1.0
-"""Samples, or different values, over which a region's edge is soft, so that its place has a derivative."""
-_SMOOTH: Final = 64
-"""Samples that one value of a feature is shared by at most once in so many, where a region's edge may move."""
-
-type Weight = Callable[[Any, Mapping[str, Any]], Float[Array, " sample"]]
-
-
-@dataclass(frozen=True)
-class _Region:
-    """A region of the features: its instance, what the page says of it, its weight at features, and its own parameters."""
-
-    name: str
-    text: str
-    weight: Weight
-    parameters: tuple[Parameter, ...] = ()
 
 
 def regional_bias(sites: Sites, data: Data) -> list[Effect]:
@@ -47,7 +26,8 @@ def regional_bias(sites: Sites, data: Data) -> list[Effect]:
     if not offers(sites, "predicted_label"):
         return []
     unit = _unit(data)
-    everywhere = _Region("everywhere", "everywhere", lambda x, _: jnp.ones(x.shape[0]))
+    whole = np.ones(len(data["x"]), bool)
+    everywhere = Region("everywhere", "everywhere", lambda x, _: jnp.ones(x.shape[0]), whole)
     return [
         Effect(
             "regional_bias",
@@ -58,7 +38,7 @@ def regional_bias(sites: Sites, data: Data) -> list[Effect]:
             source="y + b w(x), w of largest value 1.",
             requires=("x",),
         )
-        for region in [everywhere, *_regions(data), *_slopes(data)]
+        for region in [everywhere, *regions(data), *slopes(data)]
     ]
 
 
@@ -103,8 +83,17 @@ def label_noise(sites: Sites, data: Data) -> list[Effect]:
             source="s exp(c w(x)).",
             requires=("x",),
         )
-        for region in _regions(data)
+        for region in _apart(regions(data))
     ]
+
+
+def _apart(found: Sequence[Region]) -> list[Region]:
+    """The regions that are no other's complement: noise outside is another where noise inside is."""
+    kept: list[Region] = []
+    for region in found:
+        if all((region.inside == one.inside).any() for one in kept):
+            kept.append(region)
+    return kept
 
 
 def stale_map(sites: Sites, data: Data) -> list[Effect]:
@@ -173,100 +162,6 @@ def _added(weight: Weight) -> Any:
         return value + p["bias"] * weight(context["x"], p)
 
     return add
-
-
-def _columns(data: Data) -> Iterator[tuple[int, np.ndarray]]:
-    """The features that vary, by number."""
-    for index, column in enumerate(np.asarray(data["x"], float).T[:_FEATURES]):
-        if np.ptp(column) > 0:
-            yield index, column
-
-
-def _quantiles(column: np.ndarray, parts: int) -> np.ndarray:
-    return np.quantile(column, np.arange(1, parts) / parts)
-
-
-def _regions(data: Data) -> list[_Region]:
-    """The lowest, middle and highest third of each feature; of one with two values each of them.
-
-    Whoever drew a region did not know the samples' thirds: where a feature takes many values the edges are parameters.
-    """
-    regions: list[_Region] = []
-    for index, column in _columns(data):
-        low, high = (float(edge) for edge in _quantiles(column, 3))
-        places: dict[str, tuple[float, float]] = {
-            "low": (-np.inf, low),
-            "middle": (low, high),
-            "high": (high, np.inf),
-        }
-        is_smooth = np.unique(column, return_counts=True)[1].max() <= len(column) / _SMOOTH
-        for name, (first, last) in places.items():
-            inside = (column > first) & (column <= last)
-            if not inside.any() or inside.all():
-                continue
-            ends = f"({column[inside].min():.3g} to {column[inside].max():.3g})"
-            if is_smooth:
-                weight, parameters = _soft(
-                    index, column, bool(np.isfinite(first)), bool(np.isfinite(last)), inside
-                )
-            else:
-                weight, parameters = _hard(index, first, last), ()
-            text = f"where feature {index} is {name} {ends}"
-            regions.append(_Region(f"x{index}_{name}", text, weight, parameters))
-    return regions
-
-
-def _hard(index: int, first: float, last: float) -> Weight:
-    """1 inside, 0 outside."""
-
-    def within(x: Any, _: Mapping[str, Any]) -> Float[Array, " sample"]:
-        return ((x[:, index] > first) & (x[:, index] <= last)).astype(float)
-
-    return within
-
-
-def _soft(
-    index: int, column: np.ndarray, is_above: bool, is_below: bool, inside: np.ndarray
-) -> tuple[Weight, tuple[Parameter, ...]]:
-    """1 inside, 0 outside, with edges that move and have a derivative: parameters, as quantiles of the feature."""
-    values = np.unique(column)
-    quantiles = (np.arange(len(values)) + 0.5) / len(values)
-    width = _SOFT / len(values)
-    rank = np.searchsorted(values, column[inside])
-    ends = {
-        "from_quantile": (is_above, rank.min() / len(values)),
-        "to_quantile": (is_below, (rank.max() + 1) / len(values)),
-    }
-    parameters = tuple(
-        Parameter(name, dist.Normal(float(place), _EDGE), float(place), is_place=True)
-        for name, (is_end, place) in ends.items()
-        if is_end
-    )
-
-    def weight(x: Any, p: Mapping[str, Any]) -> Float[Array, " sample"]:
-        quantile, inside = jnp.interp(x[:, index], values, quantiles), jnp.ones(x.shape[0])
-        if is_above:
-            inside = inside * jax.nn.sigmoid((quantile - p["from_quantile"]) / width)
-        if is_below:
-            inside = inside * jax.nn.sigmoid((p["to_quantile"] - quantile) / width)
-        return inside
-
-    return weight, parameters
-
-
-def _slopes(data: Data) -> list[_Region]:
-    """Each feature itself, from -1 at its smallest to 1 at its largest value."""
-    slopes: list[_Region] = []
-    for index, column in _columns(data):
-        middle, half = float(column.max() + column.min()) / 2, float(np.ptp(column)) / 2
-
-        def along(
-            x: Any, _: Mapping[str, Any], index: int = index, middle: float = middle, half: float = half
-        ) -> jax.Array:
-            return (x[:, index] - middle) / half
-
-        slopes.append(_Region(f"x{index}_slope", f"in proportion to feature {index}", along))
-    return slopes
 
 
 FAMILIES: Final[dict[str, Family]] = {

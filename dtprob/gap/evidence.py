@@ -71,8 +71,8 @@ class Evidence:
             rest = step.view.fitted.effects
             if step.accepted is None or {*rest, step.accepted} != set(self.accepted):
                 continue
-            for fitted in step.trials.fits.values():
-                found.setdefault(frozenset(fitted.effects), Start(step.trials.problem, fitted))
+            for name, fitted in step.trials.fits.items():
+                found.setdefault(frozenset(fitted.effects), step.trials.at(name))
         for rival in self.rivals:
             found.setdefault(frozenset(rival.fitted.effects), rival)
         return {one.fitted.effects: one for one in found.values()} if self.accepted else {}
@@ -85,9 +85,7 @@ class Evidence:
         first = self.steps[0]
         if not found or first.view.fitted.effects:
             return found
-        singles = {fitted.effects: fitted for fitted in first.trials.fits.values()}
+        singles = {fitted.effects: name for name, fitted in first.trials.fits.items()}
         return found | {
-            names: Start(first.trials.problem, fitted)
-            for names, fitted in singles.items()
-            if frozenset(names) not in seen
+            names: first.trials.at(name) for names, name in singles.items() if frozenset(names) not in seen
         }

@@ -49,9 +49,11 @@ def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> 
         np.where(nothing, 1.0, mean),
         np.where(nothing, 1.0, np.maximum(variance, 1e-12 * mean**2)),
     )
-    observed = np.where(nothing, 1.0, observed)
-    log_p = np.where(nothing, 0.0, log_gamma_tail(observed * mean / variance, mean**2 / variance))
-    return np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
+    value, shape = np.where(nothing, 1.0, observed) * mean / variance, mean**2 / variance
+    log_p = np.where(nothing, 0.0, log_gamma_tail(value, shape))
+    lower = special.ndtri_exp(np.log(np.maximum(special.gammainc(shape, value), 1e-300)))
+    quantile = np.where((log_p > np.log(0.5)) & ~nothing, lower, normal_quantile(log_p))
+    return np.exp(np.maximum(log_p, LOG_SMALLEST)), quantile
 
 
 _MOST_SKEW: Final = 1.7

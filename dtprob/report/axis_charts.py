@@ -57,9 +57,10 @@ def _difference_chart(data: xr.Dataset, index: int) -> Chart:
 
 
 def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) -> Chart:
-    complete = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]].dropna(axis)
-    before, after = complete[_BEFORE + axis], complete.get(_AFTER + axis)
-    place, unit = _places(before, axis)
+    shown = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]]
+    place, unit = _places(shown[_BEFORE + axis], axis)
+    complete = shown.assign_coords(place=(axis, place)).dropna(axis)
+    before, after, place = complete[_BEFORE + axis], complete.get(_AFTER + axis), complete["place"].values
     name, limit = capital(words(axis)), before.attrs.get("threshold") or usual_limit(before.size)
     figure = coordinate_map(
         place,

@@ -206,7 +206,7 @@ def _unlisted(report: Report) -> Story:
         "Cause unknown",
         "unknown",
         "There is a gap, and none of the known effects explains it.",
-        f"{real}, but every effect on the list was tried, and something remains with each.",
+        f"{real}, but no effect on the list accounts for it: something remains with the best of them, too.",
         f"Do not add a listed effect: it would hide the problem, not solve it. {look}",
     )
 

@@ -95,18 +95,26 @@ def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float
         for parameter in effect.fitted:
             block = problem.layout[effect.site_name(parameter.name)]
             value = x[block.index[0]].reshape(parameter.shape)
-            sd = np.asarray(prior_scale(parameter.prior)) * np.ones(parameter.shape)
+            sd = prior_scale(parameter.prior, parameter.null) * np.ones(parameter.shape)
+            # the null may not count as support
             inside = np.maximum(value, parameter.null + 1e-9 * sd) if parameter.is_one_sided else value
-            total += float(_log_prob(parameter.prior, inside))  # the null may not count as support
-            gradient[block.index[0]] = -((value - parameter.null) / sd**2).reshape(-1)
-            curvature[block.index[0]] = (1 / sd**2 * np.ones(parameter.shape)).reshape(-1)
+            density, slope, bend = map(np.asarray, _log_prob(parameter.prior, inside))
+            total += float(density)
+            gradient[block.index[0]] = slope.reshape(-1)
+            curvature[block.index[0]] = np.where(bend > 0, bend, 1 / sd.reshape(-1) ** 2)
     return total, gradient, curvature
 
 
 @jax.jit
-def _log_prob(prior: dist.Distribution, value: np.ndarray) -> jax.Array:
-    """Of all entries together; one program for each kind of distribution, whose numbers are arguments."""
-    return jnp.sum(prior.log_prob(value))
+def _log_prob(prior: dist.Distribution, value: np.ndarray) -> tuple[jax.Array, jax.Array, jax.Array]:
+    """Of all entries together, its slope, and minus its curvature along each; one program for each kind of distribution."""
+
+    def total(flat: jax.Array) -> jax.Array:
+        return jnp.sum(prior.log_prob(flat.reshape(value.shape)))
+
+    flat = jnp.asarray(value, float).reshape(-1)
+    slope = jax.grad(total)
+    return total(flat), slope(flat), -jnp.diagonal(jax.jacfwd(slope)(flat))
 
 
 def basis(problem: Problem, active: Active) -> np.ndarray:

@@ -26,9 +26,11 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
     prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
     if problem.volume is not None and n:
-        weights, place = np.asarray(active.weights), np.isin(g_index, problem.volume.index)
-        prior_gradient[problem.volume.index] += weights @ problem.volume.gradient(x)
-        curvature[np.ix_(place, place)] -= np.tensordot(weights, problem.volume.bend, 1)
+        weights, volume = np.asarray(active.weights), problem.volume
+        prior_gradient[volume.index] += weights @ volume.gradient(x)
+        free = np.flatnonzero(np.isin(volume.index, g_index))
+        place = np.searchsorted(g_index, volume.index[free])
+        curvature[np.ix_(place, place)] -= np.tensordot(weights, volume.bend, 1)[np.ix_(free, free)]
     cross = cross + np.moveaxis(hessian[:n][:, l_index], 0, 1)
     local = local + np.moveaxis(hessian[n:][:, l_index], 0, 1)
     for j in range(l_index.shape[1]):

@@ -21,6 +21,7 @@ from dtprob.gap.fitting.newton import System, newton_step, positive
 from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.model.volume import Volume
 
 _TRIES: Final = 8
 _SETTLED: Final = 0.01
@@ -44,6 +45,7 @@ class Fit:
         covariance: of the free global coordinates, in the order of `global_index`.
         global_index: their positions in the flat vector.
         converged: whether the last step was negligible.
+        volume: what integrating unknowns out adds about this mode, where another expansion than the problem's was needed.
     """
 
     x: np.ndarray
@@ -54,6 +56,11 @@ class Fit:
     covariance: np.ndarray
     global_index: np.ndarray
     converged: bool
+    volume: Volume | None = None
+
+    def within(self, problem: Problem) -> Problem:
+        """The problem with the expansion about this mode."""
+        return problem if self.volume is None else problem.with_volume(self.volume)
 
 
 @np.errstate(over="ignore", invalid="ignore")  # bad starting points lead far out

@@ -10,6 +10,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import local_maxima, polish
 from dtprob.gap.fitting.marginal import settled
+from dtprob.gap.fitting.marginal_mode import faithful
 from dtprob.gap.fitting.plausible import LARGE, places, scales, sides
 from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
@@ -38,7 +39,7 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     if effect.kind == "variance":
         return fitting.fit(problem, _at_null(problem, fitted.x, [effect.name]), names)
     best = max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
-    return settled(problem, best)
+    return faithful(problem, settled(problem, best), starts)
 
 
 def polished(
@@ -60,7 +61,12 @@ def polished(
     reach = _REACH * max(gain.values(), default=0.0)
     able = [name for name in trials if kinds[name] == "mean" and gain[name] >= reach]
     best = sorted(able, key=lambda name: -gain[name])[:count]
-    return {name: polish(problem, one) if name in best else one for name, one in trials.items()}
+    return {name: _polish(problem, one) if name in best else one for name, one in trials.items()}
+
+
+def _polish(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
+    """A fit freed from local optima; as it is where an expansion about it is all that keeps noise from vanishing."""
+    return fitted if problem.volume is not None else polish(problem, fitted)
 
 
 def without(
@@ -83,7 +89,7 @@ def without(
             x = _at_null(problem, trials[effect.name].x, [effect.name])
             fits.append(fitting.fit(problem, x, before.effects, spread=before.spread))
     found = max(fits, key=lambda f: f.log_evidence, default=before)
-    return polish(problem, found) if found.log_evidence > before.log_evidence + _BETTER else None
+    return _polish(problem, found) if found.log_evidence > before.log_evidence + _BETTER else None
 
 
 def starting_points(

@@ -7,7 +7,7 @@ cluster's own, or a spread, widens the prediction there. Both are judged on clus
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -32,6 +32,8 @@ _LEAST: Final = 3.0
 """Nats of evidence that a family must bring."""
 _SAME: Final = 0.99
 """Families of one pattern and nearly the same evidence are one thing under two names."""
+_PROMISING: Final = 0.5
+"""Share of a gain that a family's evidence to first order shows at least."""
 _NAME: Final = "remainder"
 
 
@@ -108,18 +110,25 @@ def model_remainder(
     )
 
 
-def alone(view: View) -> float:
+def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) -> float:
     """Log evidence of the fit with the one family of a site that has the most, less the price of having picked it.
 
     Minus infinity where none is suspected. Families of which each cluster has its own weights are left out: they follow
     anything.
+
+    Args:
+        view: the fit without any effect, and the families that are suspected there.
+        least: log evidence that matters; families that promise less than half of what that gains are not fitted.
+        begun: called before fits.
     """
-    problem = view.problem
-    shared = [s for s in view.location.suspects if not is_per_cluster(problem, s)]
+    problem, enough = view.problem, _PROMISING * (least - view.fitted.log_evidence)
+    promising = [s for s in view.location.suspects if s.evidence - s.price > enough]
+    shared = [s for s in promising if not is_per_cluster(problem, s)]
     apart = {(s.site, round(s.evidence, 3)): s for s in shared if size_of(problem, s) <= _WEIGHTS}
     named = _named(list(apart.values())[:_TRIED])
     if not named:
         return -np.inf
+    begun()
     wider, fitted = _wider(view, named)
     return max(_fitted_with(wider, fitted, name).log_evidence - s.price for name, s in named.items())
 

@@ -53,12 +53,11 @@ def _check_finite(effect: Effect, site: str, before: np.ndarray, after: np.ndarr
     lost = np.isfinite(before) & ~np.isfinite(after)
     if lost.any():
         read = ", ".join(effect.requires) or "the columns that it reads"
-        raise InputError(
-            f"effect {effect.name}",
-            f"finite values of site {site!r}",
-            f"{int(lost.sum())} of {lost.size} that are not",
-            f"Look for missing values in {read}; leave those rows out or fill them",
-        )
+        remedy = f"Look for missing values in {read}; leave those rows out or fill them"
+        if lost.sum() == np.isfinite(before).sum():
+            remedy = f"Give parameters another null than {_named(effect.null())}, as where one divides"
+        got = f"{int(lost.sum())} of {lost.size} that are not"
+        raise InputError(f"effect {effect.name}", f"finite values of site {site!r}", got, remedy)
 
 
 def _check_slope(effect: Effect, values: Mapping[str, jax.Array], context: Context) -> None:

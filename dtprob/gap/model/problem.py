@@ -149,6 +149,7 @@ class Problem:
         _ = self.programs, self.float_sites, self.field_shapes  # made once, then shared
         other = copy(self)
         other.set_live(tuple(e for e in self.effects if e.name in names))
+        other.volume = self.volume_in(other)
         return other
 
     def with_fields(self, fields: Sequence[Effect], per_cluster: Sequence[str] = ()) -> Problem:
@@ -164,7 +165,18 @@ class Problem:
         for name in ("programs", "field_shapes"):
             other.__dict__.pop(name, None)
         other.set_live(other.effects)
+        other.volume = self.volume_in(other)
         return other
+
+    def volume_in(self, other: Problem) -> Volume | None:
+        """The volume in another problem's coordinates, without those that it lacks."""
+        if self.volume is None:
+            return None
+        mark, there = np.zeros(self.dimension), np.zeros(other.dimension)
+        mark[self.volume.index] = np.arange(1, len(self.volume.index) + 1)
+        other.layout.copy_into(there, self.layout, mark)
+        kept = np.array([int(np.argmax(there == k)) if k in there else -1 for k in mark[self.volume.index]])
+        return self.volume.part(np.flatnonzero(kept >= 0), kept[kept >= 0])
 
     def with_candidates(self, effects: Sequence[Effect]) -> Problem:
         """The same problem with candidates of the same names but other nulls and priors; nothing is compiled anew.
@@ -179,6 +191,7 @@ class Problem:
 
     def with_volume(self, volume: Volume | None) -> Problem:
         """The same problem, in which the clusters' own unknowns are integrated out as the volume says."""
+        _ = self.compiled  # shared
         other = copy(self)
         other.volume = volume
         return other

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -10,12 +10,12 @@ from jaxtyping import Float, Int
 
 @dataclass(frozen=True)
 class Volume:
-    """Expansion of V_c = -1/2 log |H_c| in what clusters of the base model share.
+    """Expansion of V_c = -1/2 log |H_c| in what clusters share.
 
     H_c is the curvature of a cluster's own unknowns; of states that they share, V_c is the part that a cluster is given.
 
     Attributes:
-        index: positions of the shared coordinates in a flat vector.
+        index: positions of the shared coordinates, and of effects' parameters, in a flat vector.
         centre: these, about which it is expanded.
         value: V_c there.
         slope: first derivatives.
@@ -36,3 +36,8 @@ class Volume:
     def gradient(self, x: Float[np.ndarray, " dimension"]) -> Float[np.ndarray, "cluster shared"]:
         """Its derivatives there."""
         return self.slope + self.bend @ (x[self.index] - self.centre)
+
+    def part(self, kept: Int[np.ndarray, " kept"], index: Int[np.ndarray, " kept"]) -> Volume:
+        """The expansion in some of its coordinates, the others where they are, and where these stand in a flat vector."""
+        bend = self.bend[:, kept][:, :, kept]
+        return replace(self, index=index, centre=self.centre[kept], slope=self.slope[:, kept], bend=bend)

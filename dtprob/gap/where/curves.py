@@ -93,19 +93,26 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     yield from _ripples(axis, place, _FINEST)
     found = columns(problem, axis, size)
     for name, column in found.items():
-        groups, index = np.unique(column, return_inverse=True)
-        if np.issubdtype(column.dtype, np.floating) or 2 * len(groups) > size:
+        if _is_ordered(column):
             yield from over_column(name, column, _FINEST)
         else:
-            yield Curves(f"by {name}", grouped(index), column=name)
+            yield Curves(f"by {name}", grouped(np.unique(column, return_inverse=True)[1]), column=name)
     yield from _pairs(found, size)
+
+
+def _is_ordered(column: np.ndarray) -> bool:
+    """Whether a column (size,) measures something: its values are no names of groups, as few ones or whole numbers are."""
+    count = len(np.unique(column))
+    if np.issubdtype(column.dtype, np.floating):
+        return count >= SMOOTH_FROM
+    return 2 * count > len(column)
 
 
 def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
     """What varies with two columns (size,) together: smooth over both, along one in each group, by groups of both."""
-    smooth = [name for name, column in found.items() if np.issubdtype(column.dtype, np.floating)]
-    made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if n not in smooth}
-    made = {name: index for name, index in made.items() if 2 * (index.max() + 1) <= size}
+    is_ordered = {name: _is_ordered(column) for name, column in found.items()}
+    smooth = [n for n, c in found.items() if is_ordered[n] and np.issubdtype(c.dtype, np.floating)]
+    made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if not is_ordered[n]}
     for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
         crossed = _waves(_rank(found[one]), 1, _CROSSED), _waves(_rank(found[other]), 1, _CROSSED)
         products = crossed[0][:, None] * crossed[1][None]
@@ -156,6 +163,9 @@ def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     """Smooth over a column (size,), beyond one of its values, and ripples over them."""
     yield Curves(f"along {name}", _smooth(column))
     yield Curves(f"beyond a value of {name}", _steps(column), overlaps=True)
+    finest = min(
+        finest, len(np.unique(column)) - 1
+    )  # finer ones are the same again at the values that there are
     yield from _ripples(name, (column - column.min()) / np.ptp(column), finest)
 
 

@@ -183,4 +183,6 @@ def _at(effect: Effect, point: Float[np.ndarray, " parameter"]) -> Effect:
 def _moved(parameter: Parameter, to: float) -> Parameter:
     if not parameter.tried:
         return parameter
-    return replace(parameter, prior=dist.Normal(to, float(prior_scale(parameter.prior))), null=to)
+    return replace(
+        parameter, prior=dist.Normal(to, float(prior_scale(parameter.prior, parameter.null))), null=to
+    )

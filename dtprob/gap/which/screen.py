@@ -32,6 +32,8 @@ from dtprob.gap.which.places import Placed
 
 _ABSORBED = 0.98
 _SEEN = 25.0
+_SHOWN = 10.0
+"""Nats of an effect that the data show, however much of it nuisances could take up."""
 _NOTHING = 1e-9
 
 
@@ -275,6 +277,8 @@ def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Eff
     own = np.diag(scores.part(k))
     left = own / np.maximum(scores.total[group], 1e-300)
     if left.max() > 1 - _ABSORBED or (own * scales(scores.effects[k]) ** 2).max() > _SEEN:
+        return None
+    if scores.log_bayes_factor[k] > _SHOWN:
         return None
     blocks = [b for b in activate(problem, fitted.effects).blocks if not b.local]
     owners = np.concatenate([[i] * b.size for i, b in enumerate(blocks)]) if blocks else np.zeros(0, int)

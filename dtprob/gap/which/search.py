@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.marginal_mode import faithful
 from dtprob.gap.fitting.refit import at_null_except, refit, starting_points, without
 from dtprob.gap.how_far.remainder import alone
 from dtprob.gap.model.problem import Problem
@@ -27,7 +28,7 @@ _REVISIONS: Final = 4
 """Earlier choices that are looked at again after each step."""
 _NEARLY: Final = 3.0
 """Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect; by which
-one family of a site has to be better than a random field that stands in for it."""
+one family of a site has to be better than effects that stand in for it."""
 _UNDERSTATED: Final = 0.15
 """Share of a gain that first-order scores may miss."""
 
@@ -45,7 +46,7 @@ class Step:
         """The fit with the effect that was accepted, or the one of the view."""
         if self.accepted is None:
             return Start(self.view.problem, self.view.fitted)
-        return Start(self.trials.problem, self.trials.fits[self.accepted])
+        return self.trials.at(self.accepted)
 
 
 @dataclass(frozen=True)
@@ -65,9 +66,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     """Look for the effects that are missing, one after another; of several ways the one whose end has most credit stands.
 
     Where a random field was accepted, which can imitate several effects at once, the search goes on without it too, but not
-    without one whose place was found, which can imitate little. A field alone that one family of a site beats is taken
-    back: it stands in for an effect that is not known. Where a pair promises as much as was reached, the search starts from
-    that pair.
+    without one whose place was found, which can imitate little. Where a pair promises as much as was reached, the search
+    starts from that pair. A set that one family of a site beats is taken back: it stands in for what is not known.
 
     Args:
         problem: the model and candidates on their data.
@@ -85,7 +85,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         say(f"looking for effects that {field} may have imitated")
         rest = _refitted_without(end.problem, end.fitted, field)
         key = jax.random.fold_in(key, 1)
-        others = _forward(end.problem, rest, key, settings, say, base=base, banned=field)
+        others = _forward(rest.problem, rest.fitted, key, settings, say, base=base, banned=field)
         ways.append([*steps[:-1], *others])
     reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
     pair = _promising(ways, reached - base.log_evidence, settings)
@@ -97,9 +97,11 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
     first, bare = ways[0][-1].view.fitted, steps[0].view
-    if first.effects == (field,):
-        say(f"looking whether {field} stands in for what varies more simply at a site")
-        if alone(bare) > credit(problem, first, base) + _NEARLY:
+    if first.effects:
+        least = credit(problem, first, base) + _NEARLY
+        stands_in = "stands" if len(first.effects) == 1 else "stand"
+        doing = f"looking whether {' and '.join(first.effects)} {stands_in} in for what varies more simply at a site"
+        if alone(bare, least, lambda: say(doing)) > least:
             ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
@@ -139,7 +141,7 @@ def _refitted_with(seen: View, pair: tuple[str, str], settings: Settings) -> Sta
         step = seen.screening.step.get(name) if not fitted.effects else None
         starts = starting_points(problem, fitted.x, effects[name], step, settings)
         fitted = refit(problem, fitted, effects[name], starts)
-    return Start(problem, fitted)
+    return Start(fitted.within(problem), fitted)
 
 
 def _forward(
@@ -217,15 +219,18 @@ def _revised(
         if left_out is None:
             return
         rest = _refitted_without(reached.problem, reached.fitted, left_out)
-        looked.add(frozenset(rest.effects))
+        looked.add(frozenset(rest.fitted.effects))
         again = jax.random.fold_in(key, i)
-        seen = _looked(reached.problem, rest, again, settings, say, located=False)  # chosen by scores alone
+        # chosen by scores alone
+        seen = _looked(rest.problem, rest.fitted, again, settings, say, located=False)
         trials = tried(seen, settings, say, {left_out: reached}, banned=banned)
         last = Step(seen, trials, best(seen, base, trials.fits, settings))
         yield last
 
 
-def _refitted_without(problem: Problem, fitted: fitting.Fit, name: str) -> fitting.Fit:
+def _refitted_without(problem: Problem, fitted: fitting.Fit, name: str) -> Start:
     """The fit with all its effects but one."""
     others = tuple(e for e in fitted.effects if e != name)
-    return fitting.fit(problem, at_null_except(problem, fitted, others), others, spread=fitted.spread)
+    x = at_null_except(problem, fitted, others)
+    found = faithful(problem, fitting.fit(problem, x, others, spread=fitted.spread), [x])
+    return Start(found.within(problem), found)

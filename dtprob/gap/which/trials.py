@@ -62,6 +62,10 @@ class Trials:
     problem: Problem
     fits: Mapping[str, fitting.Fit]
 
+    def at(self, name: str) -> Start:
+        """The refit that adds an effect."""
+        return Start(self.fits[name].within(self.problem), self.fits[name])
+
 
 NOTHING: Final[Mapping[str, Start]] = MappingProxyType({})
 
@@ -92,12 +96,7 @@ def tried(
     problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
     effects = {e.name: e for e in problem.effects}
-    trials = {
-        name: fitting.fit(
-            problem, problem.translate(at.fitted.x, at.problem), at.fitted.effects, spread=at.fitted.spread
-        )
-        for name, at in known.items()
-    }
+    trials = {name: _again(problem, at) for name, at in known.items()}
     for name in chosen:
         say(f"refitting with {name}")
         starts = starting_points(problem, start.x, effects[name], screening.step.get(name), settings)
@@ -110,6 +109,13 @@ def tried(
     count = min(settings.polished, _POLISHED_LATER) if fitted.effects else settings.polished
     new = {name: one for name, one in trials.items() if name not in known}
     return Trials(problem, {**trials, **polished(problem, start, new, count)})
+
+
+def _again(problem: Problem, at: Start) -> fitting.Fit:
+    """A fit once more in a problem in which other effects are live too."""
+    volume, x = at.problem.volume_in(problem), problem.translate(at.fitted.x, at.problem)
+    found = fitting.fit(problem.with_volume(volume), x, at.fitted.effects, spread=at.fitted.spread)
+    return replace(found, volume=volume)
 
 
 def _together(problem: Problem, names: Sequence[str]) -> Problem:

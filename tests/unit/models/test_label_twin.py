@@ -178,3 +178,16 @@ def test_a_case(tmp_path):
     job = prepare(load_case(tmp_path / "case.toml"), need="diagnosis")
     assert job.data["y"].shape == (40,)
     assert "regional_bias[x2_high]" in {effect.name for effect in job.effects}
+
+
+def test_several_effects_do_not_stand_in_for_a_floor():
+    """Readings below a floor come out at it: up to three regions together follow that, one curve of the prediction better."""
+    data = rows(n=240)
+    data = data | {
+        "y": np.maximum(np.asarray(data["prediction"]), -0.3)
+        + 0.3 * np.random.default_rng(4).normal(size=240)
+    }
+    effects = catalogue(declare(label_twin, data).sites, data)
+    found = diagnose(label_twin, data, effects, key=jax.random.key(1), engine=Laplace(draws=200))
+    assert found.verdict == "UNLISTED"
+    assert "predicted_label" in found.sections["unlisted"]["sites"]

@@ -63,3 +63,11 @@ def test_long_axes_are_drawn_in_groups() -> None:
 def test_no_map_of_shares_without_a_cause() -> None:
     report: Any = {"causes": [], "gap": {"after": None}}
     assert closed_charts(report, None) == []
+
+
+def test_places_keep_their_numbers_where_others_are_not_shown() -> None:
+    report: Any = {"verdict": "UNLISTED", "where": {"coordinates": []}, "gap": {"after": None}}
+    excess = np.array([np.nan, 0.0, np.nan, 9.0, 0.1])
+    gap = xr.DataTree.from_dict({"where": xr.Dataset({"gap_link": ("link", excess)})})
+    (chart,) = coordinate_charts(report, gap)
+    assert "9.0 standard deviations at 3" in chart.svg or "9 standard deviations at 3" in chart.svg

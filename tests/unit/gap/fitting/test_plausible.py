@@ -3,10 +3,19 @@
 import numpy as np
 import numpyro.distributions as dist
 import pytest
+from numpyro.distributions.transforms import AffineTransform
 from scipy import integrate, stats
 
 from dtprob.effects.effect import Effect, Parameter
-from dtprob.gap.fitting.plausible import SCALES, log_bayes_factor, mixing_gain, nulls, scales, sides
+from dtprob.gap.fitting.plausible import (
+    SCALES,
+    log_bayes_factor,
+    mixing_gain,
+    nulls,
+    prior_scale,
+    scales,
+    sides,
+)
 
 
 def quadrature(information, score, scale, low=-np.inf):
@@ -106,3 +115,27 @@ def test_the_prior_of_a_place_is_not_mixed():
     np.testing.assert_allclose(
         mixing_gain(covariance, estimate, scale, places=~np.zeros(3, bool)), 0.0, atol=1e-10
     )
+
+
+@pytest.mark.parametrize(
+    ("prior", "null", "scale"),
+    [
+        (dist.Normal(0.0, 8.0), 0.0, 8.0),
+        (dist.Normal(0.0, 8.0).expand([3]).to_event(1), 0.0, 8.0),
+        (dist.HalfNormal(8.0), 0.0, 8.0),
+        (dist.StudentT(2.0, 0.0, 4.0), 0.0, 4.0),
+        (dist.HalfCauchy(5.0), 0.0, 5.0),
+        (dist.Exponential(0.5), 0.0, np.sqrt(8.0)),
+        (dist.Uniform(20.0, 400.0), 210.0, 380.0 / np.sqrt(12.0)),
+        (dist.LogNormal(np.log(8.0), 0.4), 0.0, 8.0 * np.exp(0.16)),
+        (dist.Gamma(2.0, 0.5), 4.0, np.sqrt(8.0)),
+    ],
+)
+def test_how_far_a_prior_puts_a_size(prior, null, scale):
+    assert np.asarray(prior_scale(prior, null)) == pytest.approx(scale, rel=1e-3)
+
+
+def test_how_far_a_prior_without_moments_puts_a_size():
+    moved = dist.TransformedDistribution(dist.Normal(0.0, 1.0), AffineTransform(0.0, 8.0))
+    assert float(prior_scale(moved)) == pytest.approx(8.0, rel=0.05)
+    assert float(prior_scale(dist.Pareto(1.0, 1.5))) == pytest.approx(2 ** (1 / 1.5) / 0.6745, rel=0.05)

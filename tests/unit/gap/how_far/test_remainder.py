@@ -261,15 +261,18 @@ def test_a_family_that_stands_alone_pays_for_having_been_picked():
         suspect(problem, "by street", evidence=50.0),
     )
 
-    def found(*suspects):
+    def found(*suspects, least=0.0):
         location = SimpleNamespace(suspects=suspects)
-        return alone(SimpleNamespace(problem=problem, fitted=fitted, location=location))
+        view = SimpleNamespace(problem=problem, fitted=fitted, location=location)
+        return alone(view, fitted.log_evidence + least)
 
     free = found(place)
     assert free > found(street) + 20.0
     assert found(place, street) == pytest.approx(free, abs=1e-6)
     assert found(replace(place, price=7.0), street) == pytest.approx(free - 7.0, abs=1e-6)
     assert found() == -np.inf
+    assert found(place, least=110.0) == pytest.approx(free, abs=1e-6)
+    assert found(place, least=130.0) == -np.inf  # it does not promise half of that
 
 
 def test_predictions_of_a_right_model_are_calibrated():

@@ -247,3 +247,23 @@ def test_rows_go_back_to_where_they_were_observed():
     values = {"y": jnp.asarray(flat.reshape(2, 12, 8))}
     np.testing.assert_array_equal(problem.rows.unstack(np.asarray(problem.rows.stack(values))), flat)
     assert SimpleNamespace(**problem.located).y == 1
+
+
+def test_a_measured_column_of_few_values_makes_groups_and_no_ripples():
+    """Storeys as 0.0, 1.0, 2.0: ripples over three values are the same few curves again and again."""
+    floor = jnp.asarray(np.arange(LENGTH) % 3, float)
+    found = curves(Problem(table, {**rows(), "place": floor}, [bend()], "row"), "row", LENGTH)
+    of_floor = [c for c in found if "place" in c.label]
+    assert {c.label for c in of_floor} >= {"by place", "along x by place"}
+    assert not any(c.ripple is not None or c.overlaps for c in of_floor)
+
+
+def test_ripples_are_no_finer_than_the_values_are_many():
+    eight = jnp.asarray(np.arange(LENGTH) % 8, float)
+    found = curves(Problem(table, {**rows(), "place": eight}, [bend()], "row"), "row", LENGTH)
+    bands = [c for c in found if c.ripple is not None and c.ripple.over == "place"]
+    assert sum(c.extent[0] for c in bands) == 3  # half waves 5 to 7, beyond the smooth ones
+    waves = np.concatenate([c.values for c in found if c.label == "along place" or c in bands])
+    distinct = np.unique(waves, axis=1)
+    assert distinct.shape[1] == 8
+    assert np.linalg.matrix_rank(distinct) == 8

@@ -1,0 +1,189 @@
+"""The mode of the density from which states, or what each cluster has of its own, are integrated out.
+
+Integrated out by Laplace's method the unknowns of cluster c add V_c = -1/2 log |H_c| to the log density, H_c their
+curvature. About its mode V_c is expanded to second order in all else that is fitted, the base model's shared unknowns and
+the parameters of mean effects (Tierney and Kadane 1986; Rue, Martino and Chopin 2009, section 3).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+from typing import Final, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from dtprob.effects.effect import Effect
+from dtprob.gap.fitting.active import activate
+from dtprob.gap.fitting.density import terms_of
+from dtprob.gap.fitting.fit import Fit, fit
+from dtprob.gap.fitting.marginal import own_mode
+from dtprob.gap.fitting.plausible import nulls, scales, sides
+from dtprob.gap.fitting.states import held, states, states_mode
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.model.volume import Volume
+
+_ROUNDS: Final = 10
+_SHARES: Final = (1.0, 0.5, 0.25, 0.1, 0.03)
+ARRIVED: Final = 0.01
+"""Nats by which a round has to be better."""
+_FAR: Final = 1.0
+"""Standard deviations of the prior that a coordinate moves in a round at most."""
+STEP: Final = 0.1
+"""Of the differences, in standard deviations of a coordinate's prior."""
+_DENSE: Final = 12
+"""Shared coordinates up to which second differences between two of them are taken too."""
+_EXACT: Final = 1e-7
+_FAITHFUL: Final = 0.5
+"""Nats that the expansion may be off at a fit."""
+
+
+class Mode(NamedTuple):
+    """Of the marginal density: where, its logarithm, the expansion there, and whether the last round gained nothing."""
+
+    x: np.ndarray
+    height: float
+    volume: Volume
+    arrived: bool
+
+
+@dataclass(frozen=True)
+class Around:
+    """What is fitted while the rest is integrated out.
+
+    Attributes:
+        effects: mean effects that are free.
+        index: positions of the coordinates.
+        scale: standard deviations of their priors.
+        lowest: values that they cannot go below.
+    """
+
+    effects: tuple[str, ...]
+    index: Int[np.ndarray, " shared"]
+    scale: Float[np.ndarray, " shared"]
+    lowest: Float[np.ndarray, " shared"]
+
+
+def around(problem: Problem, names: Sequence[str] = ()) -> Around:
+    """The base model's shared unknowns, and after them the parameters of mean effects."""
+    index = [held(problem)]
+    scale = [np.maximum(problem.prior_middle[1][index[0]], 1e-12)]
+    lowest = [np.full(len(index[0]), -np.inf)]
+    for effect in (e for e in problem.live if e.name in names):
+        index.append(_positions(problem, effect))
+        scale.append(scales(effect))
+        lowest.append(np.where(sides(effect), nulls(effect), -np.inf))
+    return Around(tuple(names), *(np.concatenate(part) for part in (index, scale, lowest)))
+
+
+def _positions(problem: Problem, effect: Effect) -> np.ndarray:
+    return np.asarray(problem.layout.indices(effect.site_name(p.name) for p in effect.parameters))
+
+
+def faithful(problem: Problem, fitted: Fit, starts: Sequence[np.ndarray]) -> Fit:
+    """A fit with mean effects, or where the expansion does not hold there the mode that is found by expanding again.
+
+    Args:
+        problem: in which the effects are live.
+        fitted: with the volume of the problem.
+        starts: flat vectors from which a search for the mode may start.
+    """
+    kinds = {e.name: e.kind for e in problem.live}
+    if problem.volume is None or any(kinds[name] == "variance" for name in fitted.effects):
+        return fitted
+    free = around(problem, fitted.effects)
+    reached = height_at(problem, fitted.x, free)
+    if abs(reached[1] - fitted.log_posterior) < _FAITHFUL:
+        return fitted
+    here, height = max((reached, *(height_at(problem, x, free) for x in starts)), key=lambda found: found[1])
+    mode = about_the_mode(problem, here, height, free)
+    return fitted_at(problem, mode, free)
+
+
+def fitted_at(problem: Problem, mode: Mode, free: Around) -> Fit:
+    """The fit at a mode, with the expansion there."""
+    whole = problem.with_volume(mode.volume)
+    found = fit(whole, mode.x, free.effects)
+    if height_at(problem, found.x, free)[1] < mode.height - ARRIVED:
+        found = replace(fit(whole, mode.x, free.effects, steps=0), converged=mode.arrived)
+    return replace(found, volume=mode.volume)
+
+
+def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Around) -> Mode:
+    """The mode of the marginal density, from a point and the log density there."""
+    for _ in range(_ROUNDS):
+        volume = _expanded(problem, here, free)
+        move = (fit(problem.with_volume(volume), here, free.effects).x - here)[free.index]
+        move *= min(1.0, _FAR / float(np.max(np.abs(move) / free.scale, initial=1e-300)))
+        best, highest = here, height
+        for share in _SHARES:
+            trial = here.copy()
+            trial[free.index] += share * move
+            trial, value = height_at(problem, trial, free)
+            if value > height:
+                best, highest = trial, value
+                break
+        if highest - height < ARRIVED:
+            return Mode(here, height, volume, arrived=True)
+        here, height = best, highest
+    return Mode(here, height, _expanded(problem, here, free), arrived=False)
+
+
+def height_at(problem: Problem, x: np.ndarray, free: Around) -> tuple[np.ndarray, float]:
+    """The point with what is integrated out at its mode, and the log density without it."""
+    x, volume = _inner(problem, x)
+    total = float(terms_of(problem, activate(problem, free.effects), x).sum()) + float(volume.sum())
+    return x, total if np.isfinite(total) else -np.inf
+
+
+def _inner(
+    problem: Problem, x: np.ndarray, tolerance: float = 1e-3
+) -> tuple[np.ndarray, Float[np.ndarray, " cluster"]]:
+    """The point with what is integrated out, states or the clusters' own unknowns, at its mode, and V_c there."""
+    bare = problem.with_volume(None)
+    shared_states = states(bare)
+    if shared_states.blocks:
+        x, curvature = states_mode(bare, shared_states, x, tolerance=tolerance)
+        volume = -0.5 * np.linalg.slogdet(curvature)[1]
+        return x, np.full(problem.n_cluster, volume / problem.n_cluster)
+    x, local = own_mode(bare, activate(bare), x, tolerance=tolerance)
+    return x, -0.5 * np.linalg.slogdet(local)[1]
+
+
+def _volume_at(problem: Problem, x: np.ndarray, index: np.ndarray, move: np.ndarray) -> np.ndarray:
+    """V_c (cluster,) where fitted coordinates are moved from a point, what is integrated out following."""
+    moved = x.copy()
+    moved[index] += move
+    return _inner(problem, moved, _EXACT)[1]
+
+
+def beside(problem: Problem, x: np.ndarray, free: Around, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """V_c (cluster, shared) a step up and a step down each fitted coordinate."""
+    up, down = (
+        np.stack([_volume_at(problem, x, free.index, sign * unit) for unit in np.diag(step)], axis=1)
+        for sign in (1.0, -1.0)
+    )
+    return up, down
+
+
+def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
+    """V_c about a point, by central differences; what curves upwards is taken as straight.
+
+    Where a step down would lead below what a coordinate can be, the point about which it is looked at is a step above.
+    """
+    step, at = STEP * free.scale, x.copy()
+    at[free.index] = np.maximum(x[free.index], free.lowest + step)
+    n, units = len(step), np.diag(step)
+    middle = _volume_at(problem, at, free.index, np.zeros(n))
+    up, down = beside(problem, at, free, step)
+    slope = (up - down) / 2
+    bend = (up + down - 2 * middle[:, None])[:, :, None] * np.eye(n)
+    for i, j in combinations(range(n if n <= _DENSE else 0), 2):
+        both = sum(_volume_at(problem, at, free.index, sign * (units[i] + units[j])) for sign in (1.0, -1.0))
+        bend[:, i, j] = bend[:, j, i] = both / 2 - middle - (bend[:, i, i] + bend[:, j, j]) / 2
+    value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
+    values, vectors = np.linalg.eigh(bend)
+    bend = np.einsum("cij,cj,ckj->cik", vectors, np.minimum(values, 0.0), vectors)
+    return Volume(free.index, at[free.index], value, slope / step, bend / np.outer(step, step))

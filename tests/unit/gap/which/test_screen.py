@@ -1,0 +1,68 @@
+"""Which candidates are judged: what nuisances take up is not, unless the data show it all the same."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from scipy import optimize
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.gap.view import view
+
+
+def slope(x, apart, y=None):
+    """A line through zero."""
+    del apart
+    b = numpyro.sample("b", dist.Normal(0.0, 100.0))
+    with numpyro.plate("row", len(x)):
+        mean = numpyro.deterministic("mean", b * x)
+        numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+def data_with(size):
+    """Of the effect's column 99% is the slope's own."""
+    rng = np.random.default_rng(0)
+    x, apart, noise = rng.normal(size=(3, 400))
+    return {
+        "x": jnp.asarray(x),
+        "apart": jnp.asarray(apart),
+        "y": jnp.asarray(0.7 * x + size * (x + 0.1 * apart) + noise),
+    }
+
+
+def nearly_the_slope(prior):
+    return Effect(
+        "nearly",
+        {"mean": lambda value, p, context: value + p["by"] * (context["x"] + 0.1 * context["apart"])},
+        (Parameter("by", prior),),
+    )
+
+
+@pytest.mark.parametrize(("size", "hidden_by"), [(0.0, "b"), (3.5, None)])
+def test_what_the_data_show_is_not_absorbed(size, hidden_by):
+    problem = Problem(slope, data_with(size), [nearly_the_slope(dist.Normal(0.0, 2.0))])
+    base = fitting.fit(problem, problem.null())
+    seen = view(problem, base, jax.random.key(0), Settings(replicates=100, site_replicates=19), located=False)
+    assert seen.screening.absorbed_by == (hidden_by,)
+
+
+@pytest.mark.parametrize("prior", [dist.LogNormal(np.log(3.0), 0.2), dist.Gamma(9.0, 4.0)])
+def test_a_refit_finds_the_mode_under_any_prior(prior):
+    data, effect = data_with(3.5), nearly_the_slope(prior)
+    problem = Problem(slope, data, [effect]).with_live(["nearly"])
+    start = problem.null()
+    start[problem.layout.indices(["nearly.by"])] = 2.0
+    found = fitting.fit(problem, start, ["nearly"])
+
+    def loss(at):
+        mean = at[0] * data["x"] + at[1] * (data["x"] + 0.1 * data["apart"])
+        prior_loss = 0.5 * (at[0] / 100) ** 2 - prior.log_prob(at[1])
+        return float(0.5 * jnp.sum((data["y"] - mean) ** 2) + prior_loss)
+
+    best = optimize.minimize(loss, [0.7, 2.0], method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8}).x
+    assert found.x[problem.layout.indices(["b", "nearly.by"])] == pytest.approx(best, abs=2e-3)
