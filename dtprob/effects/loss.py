@@ -28,20 +28,52 @@ from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.elements import DIRECTION
 from dtprob.raytracing.paths import PathSet
 
+_END: Final = {"tx": "transmitter", "rx": "receiver"}
+_MOST_ENDS: Final = 16
+"""Transmitters, or receivers, that are looked at one by one."""
 
-def gain_offset(sites: Sites, _data: Data) -> list[Effect]:
-    """All paths are stronger or weaker by one factor."""
-    if not has_phase(sites) or not offers(sites, "path_gain"):
+
+def gain_offset(sites: Sites, data: Data) -> list[Effect]:
+    """All paths are stronger or weaker by one factor, or those of one of several transmitters or receivers."""
+    if not offers(sites, "path_gain"):
         return []
-    return [
-        Effect(
-            "gain_offset",
-            {"path_gain": lambda value, p, _: value * jnp.exp(p["log_gain"])},
-            (normal("log_gain", 0.3, "Np"),),
-            physics="Common amplitude factor: transmit power, cable loss, antenna gain.",
-            source="a exp(g).",
-        )
-    ]
+    everywhere = Effect(
+        "gain_offset",
+        {"path_gain": lambda value, p, _: value * jnp.exp(p["log_gain"])},
+        (normal("log_gain", 0.3, "Np"),),
+        physics="Common amplitude factor: transmit power, cable loss, antenna gain.",
+        source="a exp(g).",
+    )
+    paths: PathSet | None = data.get("paths")
+    ends = [] if paths is None else [e for side in SIDES for e in _ends(side, paths)]
+    return [*([everywhere] if has_phase(sites) else []), *ends]  # powers have a level of their own
+
+
+def _ends(side: str, paths: PathSet) -> list[Effect]:
+    """One for each place of a side that several links share, where there are several of these."""
+    name, position = _END[side], np.round(np.asarray(getattr(paths, f"{side}_position"), float), 3)
+    places, first, count = np.unique(position, axis=0, return_index=True, return_counts=True)
+    if not 2 <= len(places) <= _MOST_ENDS or count.min() < 2:
+        return []
+    return [_of_end(side, f"{name}_{k}", place) for k, place in enumerate(places[np.argsort(first)])]
+
+
+def _of_end(side: str, instance: str, place: np.ndarray) -> Effect:
+    def strengthen(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        there = jnp.asarray(getattr(context["paths"], f"{side}_position"))
+        is_its = jnp.all(jnp.abs(there - place) < 1e-3, axis=-1).reshape(-1, *(1,) * (value.ndim - 1))
+        return value * jnp.exp(p["log_gain"] * is_its)
+
+    at = ", ".join(f"{x:g}" for x in place)
+    return Effect(
+        "gain_offset",
+        {"path_gain": strengthen},
+        (normal("log_gain", 0.3, "Np"),),
+        instance=instance,
+        physics=f"Amplitude factor of the {instance.replace('_', ' ')} at ({at}) m: its power, cable or antenna.",
+        source="a exp(g).",
+        requires=("paths",),
+    )
 
 
 def shadowing(sites: Sites, _data: Data) -> list[Effect]:

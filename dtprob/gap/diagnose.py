@@ -183,7 +183,7 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
         return "UNLISTED" if remains else "UNDETERMINED"
     if remains and cause.closed_fraction.mean < _relevance(evidence, settings):
         return "UNLISTED"
-    leaves = remains and cause.closed_fraction.mean < 1 - settings.minor
+    leaves = remains and (cause.closed_fraction.mean < 1 - settings.minor or _are_fields(evidence))
     if cause.probability < settings.credibility:
         return (
             "UNLISTED" if leaves else "UNDETERMINED"
@@ -193,8 +193,12 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
 
 def _relevance(evidence: Evidence, settings: Settings) -> float:
     """Share of the gap below which causes that leave something are no explanation; random fields imitate much."""
-    kinds = {e.kind for e in evidence.problem.effects if e.name in evidence.accepted}
-    return settings.relevance if "mean" in kinds else max(settings.relevance, settings.field_relevance)
+    return max(settings.relevance, settings.field_relevance) if _are_fields(evidence) else settings.relevance
+
+
+def _are_fields(evidence: Evidence) -> bool:
+    """Whether all that was accepted are random fields, which close much of any gap by allowing for it."""
+    return all(e.kind == "variance" for e in evidence.problem.effects if e.name in evidence.accepted)
 
 
 def _negligible(evidence: Evidence, settings: Settings) -> bool:

@@ -40,6 +40,8 @@ def cause(closed, probability=0.99):
         ("mean", None, 0.5, "UNDETERMINED"),
         ("variance", 0.85, 0.5, "LISTED"),
         ("variance", 0.95, 1e-6, "LISTED_WITH_REMAINDER"),
+        ("variance", 0.99, 1e-6, "LISTED_WITH_REMAINDER"),
+        ("variance", 0.99, 0.5, "LISTED"),
         ("variance", 0.85, 1e-6, "UNLISTED"),
     ],
 )

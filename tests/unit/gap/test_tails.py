@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from dtprob.gap.tails import largest_tail
+from dtprob.gap.tails import gamma_tail, largest_tail
 
 
 def test_the_largest_of_normal_scores_is_uniform():

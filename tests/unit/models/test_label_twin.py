@@ -181,7 +181,7 @@ def test_a_case(tmp_path):
 
 
 def test_several_effects_do_not_stand_in_for_a_floor():
-    """Readings below a floor come out at it: up to three regions together follow that, one curve of the prediction better."""
+    """Readings below a floor come out at it: regions together follow that, one curve of the prediction better."""
     data = rows(n=240)
     data = data | {
         "y": np.maximum(np.asarray(data["prediction"]), -0.3)

@@ -70,4 +70,4 @@ def test_places_keep_their_numbers_where_others_are_not_shown() -> None:
     excess = np.array([np.nan, 0.0, np.nan, 9.0, 0.1])
     gap = xr.DataTree.from_dict({"where": xr.Dataset({"gap_link": ("link", excess)})})
     (chart,) = coordinate_charts(report, gap)
-    assert "9.0 standard deviations at 3" in chart.svg or "9 standard deviations at 3" in chart.svg
+    assert "9.00 standard deviations at 3" in chart.svg
