@@ -9,7 +9,7 @@ from dtprob.gap.diagnose import decide
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.settings import Settings
-from dtprob.gap.which.trials import Start, best, credit
+from dtprob.gap.which.trials import Start, Trials, best, credit
 
 
 def evidence(kind, p_after):
@@ -116,14 +116,14 @@ def test_there_are_more_pairs_than_single_effects():
 
 def test_several_effects_in_place_of_one_are_an_explanation():
     def fitted(*names):
-        return SimpleNamespace(effects=names)
+        return SimpleNamespace(effects=names, within=lambda problem: problem)
 
     field, pair, neighbour = fitted("field"), fitted("one", "two"), fitted("three")
-    trials = SimpleNamespace(problem="tried", fits={"field": field, "three": neighbour})
+    trials = Trials("tried", {"field": field, "three": neighbour})
     first = SimpleNamespace(view=SimpleNamespace(fitted=fitted()), trials=trials, accepted="field")
     end = SimpleNamespace(
         view=SimpleNamespace(fitted=field, problem="end"),
-        trials=SimpleNamespace(problem="end", fits={}),
+        trials=Trials("end", {}),
         accepted=None,
     )
     given = {"held_before": None, "held_after": None, "floor": None, "fraction": None, "shares": ()}
