@@ -67,7 +67,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
 
     Where a random field was accepted, which can imitate several effects at once, the search goes on without it too, but not
     without one whose place was found, which can imitate little. Where a pair promises as much as was reached, the search
-    starts from that pair. A set that one family of a site beats is taken back: it stands in for what is not known.
+    starts from that pair. A field, or several effects, that one
+    family of a site beats is taken back: it stands in for what is not known.
 
     Args:
         problem: the model and candidates on their data.
@@ -97,7 +98,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
     first, bare = ways[0][-1].view.fitted, steps[0].view
-    if first.effects:
+    if len(first.effects) > 1 or first.effects == (field,):
         least = credit(problem, first, base) + _NEARLY
         stands_in = "stands" if len(first.effects) == 1 else "stand"
         doing = f"looking whether {' and '.join(first.effects)} {stands_in} in for what varies more simply at a site"
