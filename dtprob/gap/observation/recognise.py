@@ -8,6 +8,7 @@ from typing import Any, Final, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
+from numpyro.distributions.discrete import ZeroInflatedProbs
 
 from dtprob.errors import InputError
 from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, SAME, likelihood
@@ -100,7 +101,7 @@ def _compound(fn: Any, value: Any) -> _Found | None:
     """One that is made of another."""
     if isinstance(fn, (dist.MixtureSameFamily, dist.MixtureGeneral)):
         return _mixed(fn)
-    if isinstance(fn, dist.ZeroInflatedProbs):
+    if isinstance(fn, ZeroInflatedProbs):
         found = _plain(unwrapped(fn.base_dist)[0])
         if found is None or LIKELIHOODS[found.family].is_outcome:
             return None
