@@ -22,7 +22,11 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.directions import Surroundings, surroundings
 
 _REACH = 2.5
-_COARSE, _FINE = 32, 160
+_COARSE = 32
+_EVEN = np.linspace(-_REACH, _REACH, 160)
+_NEAR = np.geomspace(1e-3, 0.15, 32)
+_FINE = np.concatenate([_EVEN, _NEAR, -_NEAR])
+"""Sizes of effects that turn phases, in standard deviations of the prior: small ones closer together (a wrong carrier)."""
 _WAVES = 3
 _SCANNED = 2
 _SMALL, _LARGE = 0.02, 1.0
@@ -59,7 +63,7 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
         here = float(problem.compiled.shifted(anchor, {}, 1)[0].sum())
         probed = _likelihoods(problem, around, small)
         bent = [e for e in means if _is_bent(probed[e.name] - here)]
-        lines, likelihoods = _scanned(problem, around, bent, _COARSE)
+        lines, likelihoods = _scanned(problem, around, bent, np.linspace(-_REACH, _REACH, _COARSE))
         waves = [e for e in bent if _is_wave(likelihoods[e.name])]
         for part, values in zip(_scanned(problem, around, waves, _FINE), (lines, likelihoods), strict=True):
             values.update(part)
@@ -135,10 +139,10 @@ def centre(problem: Problem, x: np.ndarray) -> np.ndarray:
 
 
 def _scanned(
-    problem: Problem, around: Surroundings, effects: Sequence[Effect], count: int
+    problem: Problem, around: Surroundings, effects: Sequence[Effect], offsets: np.ndarray
 ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    """Flat parameters along each effect's plausible range, and the log likelihoods there."""
-    lines = {e.name: _lines(e, np.linspace(-_REACH, _REACH, count)) for e in effects}
+    """Flat parameters at each effect's sizes, in standard deviations of its prior, and the log likelihoods there."""
+    lines = {e.name: _lines(e, offsets) for e in effects}
     return lines, _likelihoods(problem, around, lines)
 
 

@@ -1,0 +1,46 @@
+"""Sizes that first-order scores cannot see: an offset that turns phases, small beside what its prior allows."""
+
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.which.scan import scan
+
+
+def waves(delay, seen=None):
+    """Phases of paths, whose common gain is unknown."""
+    gain = numpyro.sample("gain", dist.LogNormal(0.0, 0.5))
+    with numpyro.plate("path", len(delay)):
+        phase = numpyro.deterministic("phase", jnp.zeros(len(delay)))
+        numpyro.sample("seen", dist.Normal(gain * jnp.cos(phase - 1.0), 0.1), obs=seen)
+
+
+CARRIER = Effect(
+    "carrier",
+    {"phase": lambda value, p, context: value - 2 * jnp.pi * p["offset"] * context["delay"]},
+    (Parameter("offset", dist.Normal(0.0, 350.0), unit="MHz"),),
+)
+
+
+@pytest.mark.parametrize("offset", [2.0, 10.0, -23.0])
+def test_a_wrong_carrier_is_found_between_the_even_sizes(offset):
+    """Delays of up to .2 us leave a basin of some MHz, and even sizes lie 11 MHz apart."""
+    rng = np.random.default_rng(0)
+    delay = rng.uniform(0.0, 0.2, 120)
+    seen = np.cos(-2 * np.pi * offset * delay - 1.0) + 0.1 * rng.normal(size=120)
+    data = {"delay": jnp.asarray(delay), "seen": jnp.asarray(seen)}
+    problem = Problem(waves, data, [CARRIER])
+    base = fitting.fit(problem, problem.null())
+    found = scan(problem, base.x, ["carrier"])["carrier"]
+    assert found.gain > 0.0
+    wider = problem.with_live(["carrier"])
+    start = wider.translate(found.x, problem)
+    index = wider.layout.indices(["carrier.offset"])
+    start[index] = found.parameters
+    fitted = fitting.fit(wider, start, ["carrier"])
+    assert fitted.x[index] == pytest.approx(offset, abs=0.1)
