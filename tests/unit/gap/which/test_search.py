@@ -56,7 +56,9 @@ def test_a_search_that_goes_in_a_circle_ends_where_most_credit_is(monkeypatch):
     evidence = {(): 0.0, ("a",): 5.0, ("b",): 9.0}
 
     def fitted(*effects):
-        return SimpleNamespace(effects=effects, log_evidence=evidence[effects])
+        return SimpleNamespace(
+            effects=effects, log_evidence=evidence[effects], within=lambda problem: problem
+        )
 
     problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "abc"])
 
