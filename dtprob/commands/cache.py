@@ -19,9 +19,8 @@ def keep_compiled() -> None:
     folder = cache_folder()
     prune(folder, LARGEST)
     jax.config.update("jax_compilation_cache_dir", str(folder))
-    jax.config.update(
-        "jax_persistent_cache_min_compile_time_secs", 0.0
-    )  # reading one back takes a tenth of that
+    # even small programs: reading one back takes a tenth of compiling it
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 
 
 def cache_folder() -> Path:

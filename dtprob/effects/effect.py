@@ -8,12 +8,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from functools import cached_property
+from typing import Any, Final, Literal
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 from numpyro.distributions import constraints
+from scipy import stats
 
 from dtprob.errors import InputError
 
@@ -23,6 +26,8 @@ type Model = Callable[..., Any]
 type EffectKind = Literal["mean", "variance"]
 
 FIELD = "field"
+_PRIOR_DRAWS: Final = 4001
+"""Draws that tell how far a prior without a variance reaches."""
 
 
 @dataclass(frozen=True)
@@ -63,6 +68,23 @@ class Parameter:
     def size(self) -> int:
         """Number of its entries."""
         return int(np.prod(self.shape, dtype=int))
+
+    @cached_property
+    def scale(self) -> np.ndarray:
+        """How far from the null the prior puts a size: the root mean square, or a normal one's of the same median."""
+        base = self.prior
+        while isinstance(base, dist.ExpandedDistribution | dist.Independent):
+            base = base.base_dist
+        if isinstance(base, dist.Normal | dist.HalfNormal | dist.StudentT | dist.Cauchy | dist.HalfCauchy):
+            return np.asarray(base.scale)
+        try:
+            square = np.asarray(self.prior.variance) + (np.asarray(self.prior.mean) - self.null) ** 2
+        except NotImplementedError:
+            square = np.full(self.shape, np.inf)
+        if np.isfinite(square).all():
+            return np.sqrt(square)
+        strays = np.abs(np.asarray(self.prior.sample(jax.random.key(0), (_PRIOR_DRAWS,))) - self.null)
+        return np.median(strays, axis=0) / stats.norm.ppf(0.75)
 
     @property
     def is_one_sided(self) -> bool:

@@ -59,10 +59,6 @@ def _columns(data: Data) -> Iterator[tuple[int, np.ndarray]]:
             yield index, column
 
 
-def _quantiles(column: np.ndarray, parts: int) -> np.ndarray:
-    return np.quantile(column, np.arange(1, parts) / parts)
-
-
 def regions(data: Data) -> list[Region]:
     """The lowest, middle and highest third of each feature; of one of few values each of these, the largest first.
 
@@ -90,7 +86,7 @@ def _at_value(index: int, column: np.ndarray, value: float) -> Region:
 
 def _thirds(index: int, column: np.ndarray, known: Sequence[Region]) -> Iterator[Region]:
     """The lowest, middle and highest third of a feature, as far as they are none of the known regions."""
-    low, high = (float(edge) for edge in _quantiles(column, 3))
+    low, high = (float(edge) for edge in np.quantile(column, (1 / 3, 2 / 3)))
     places: dict[str, tuple[float, float]] = {
         "low": (-np.inf, low),
         "middle": (low, high),

@@ -59,16 +59,14 @@ def coordinate_map(
         if max(np.max(np.abs(np.asarray(before))), limit) > 40 * limit:
             axes.set_yscale("symlog", linthresh=limit)
         if after is not None:
-            axes.legend(
-                loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=2, labelcolor="linecolor", borderpad=0
-            )
+            _legend_above(axes)
         axes.set_xlabel(label)
         axes.set_ylabel(amount)
         return figure
 
 
 def share_map(
-    coordinate: ArrayLike,
+    coordinate: Float[np.ndarray, " coordinate"],
     found: Float[np.ndarray, " coordinate"],
     expected: Float[np.ndarray, " coordinate"],
     reach: Float[np.ndarray, " coordinate"],
@@ -78,24 +76,20 @@ def share_map(
     """Shares of what a cause closes over one coordinate, beside those that it should close.
 
     Args:
-        coordinate: (coordinate,) numbers, or names.
+        coordinate: places.
         found: shares in percent.
         expected: shares in percent that the cause closes on average.
         reach: all of `found` stay so near to `expected` in 95 of 100 data sets if the cause is right.
         label: name and unit of the coordinate.
     """
-    names = np.asarray(coordinate)
-    place = names if np.issubdtype(names.dtype, np.number) else np.arange(names.size)
     with mpl.rc_context(STYLE):
         figure, axes = plain_figure(2.7)
-        axes.fill_between(place, expected - reach, expected + reach, color=LIGHT["floor"], linewidth=0)
-        axes.plot(place, expected, "-", color=LIGHT["muted"], linewidth=1.3, label="should close")
-        axes.plot(place, found, "o", color=LIGHT["after"], markersize=4.5, label="closes")
-        _name_places(axes, names, place)
+        axes.fill_between(coordinate, expected - reach, expected + reach, color=LIGHT["floor"], linewidth=0)
+        axes.plot(coordinate, expected, "-", color=LIGHT["muted"], linewidth=1.3, label="should close")
+        axes.plot(coordinate, found, "o", color=LIGHT["after"], markersize=4.5, label="closes")
+        _name_places(axes, coordinate, coordinate)
         axes.yaxis.set_major_locator(MaxNLocator(5))
-        axes.legend(
-            loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=2, labelcolor="linecolor", borderpad=0
-        )
+        _legend_above(axes)
         axes.set_xlabel(label)
         axes.set_ylabel("Of what is closed (%)")
         return figure
@@ -106,3 +100,7 @@ def _name_places(axes: Axes, names: np.ndarray, place: np.ndarray) -> None:
         axes.set_xticks(place, [str(name) for name in names], rotation=0 if names.size <= 6 else 45)
     elif names.size <= 10:
         axes.set_xticks(place)
+
+
+def _legend_above(axes: Axes) -> None:
+    axes.legend(loc="lower left", bbox_to_anchor=(-0.02, 0.97), ncols=2, labelcolor="linecolor", borderpad=0)

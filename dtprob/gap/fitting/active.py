@@ -13,7 +13,7 @@ import numpy as np
 import numpyro.distributions as dist
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import prior_scale, scales, sizes
+from dtprob.gap.fitting.plausible import scales, sizes
 from dtprob.gap.model.layout import Block
 from dtprob.gap.model.problem import Problem
 
@@ -95,7 +95,7 @@ def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float
         for parameter in effect.fitted:
             block = problem.layout[effect.site_name(parameter.name)]
             value = x[block.index[0]].reshape(parameter.shape)
-            sd = prior_scale(parameter.prior, parameter.null) * np.ones(parameter.shape)
+            sd = parameter.scale * np.ones(parameter.shape)
             # the null may not count as support
             inside = np.maximum(value, parameter.null + 1e-9 * sd) if parameter.is_one_sided else value
             density, slope, bend = map(np.asarray, _log_prob(parameter.prior, inside))

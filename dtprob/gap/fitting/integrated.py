@@ -7,7 +7,6 @@ along; see `marginal_mode`.
 
 from __future__ import annotations
 
-from dataclasses import replace
 from typing import Final
 
 import jax
@@ -18,12 +17,12 @@ from dtprob.gap.fitting.base import fit_base, followed
 from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.marginal_mode import (
-    ARRIVED,
     STEP,
     Around,
     about_the_mode,
     around,
     beside,
+    fitted_at,
     height_at,
 )
 from dtprob.gap.fitting.states import held, states
@@ -54,24 +53,19 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     shared, has_states = held(problem), bool(states(problem).blocks)
     if not (has_states or activate(problem).local_index.shape[1]) or not len(shared):
         return Start(problem, fit_base(problem, key, polished=polished))
-    centre, deviation = problem.prior_middle
-    scale = np.maximum(deviation[shared], 1e-12)
-    centre, free = turned(problem, centre, problem.compiled.by_cluster), around(problem)
+    centre, free = turned(problem, problem.prior_middle[0], problem.compiled.by_cluster), around(problem)
     starts = [centre]
-    if not has_states and not _runs_away(problem, fit(problem, centre), centre, scale):
+    if not has_states and not _runs_away(problem, fit(problem, centre), centre, free.scale):
         joint = fit_base(problem, key, polished=polished)
-        if not _runs_away(problem, joint, centre, scale):
+        if not _runs_away(problem, joint, centre, free.scale):
             if _is_near_the_marginal_one(problem, joint, free):
                 return Start(problem, joint)
             starts.append(joint.x)
     say(f"integrating out {'states' if has_states else 'what each cluster has of its own'}")
     here, height = max((height_at(problem, x, free) for x in starts), key=lambda found: found[1])
     mode = about_the_mode(problem, here, height, free)
-    whole = problem.with_volume(mode.volume)
-    found = followed(whole, fit(whole, mode.x))
-    if height_at(problem, found.x, free)[1] < mode.height - ARRIVED:
-        found = replace(fit(whole, mode.x, steps=0), converged=mode.arrived)
-    return Start(whole, found)
+    found = fitted_at(problem, mode, free, followed)
+    return Start(found.within(problem), found)
 
 
 def _is_near_the_marginal_one(problem: Problem, joint: Fit, free: Around) -> bool:

@@ -7,7 +7,7 @@ the parameters of mean effects (Tierney and Kadane 1986; Rue, Martino and Chopin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 from typing import Final, NamedTuple
@@ -27,7 +27,7 @@ from dtprob.gap.model.volume import Volume
 
 _ROUNDS: Final = 10
 _SHARES: Final = (1.0, 0.5, 0.25, 0.1, 0.03)
-ARRIVED: Final = 0.01
+_ARRIVED: Final = 0.01
 """Nats by which a round has to be better."""
 _FAR: Final = 1.0
 """Standard deviations of the prior that a coordinate moves in a round at most."""
@@ -102,11 +102,20 @@ def faithful(problem: Problem, fitted: Fit, starts: Sequence[np.ndarray]) -> Fit
     return fitted_at(problem, mode, free)
 
 
-def fitted_at(problem: Problem, mode: Mode, free: Around) -> Fit:
-    """The fit at a mode, with the expansion there."""
+def fitted_at(
+    problem: Problem, mode: Mode, free: Around, freed: Callable[[Problem, Fit], Fit] = lambda _, found: found
+) -> Fit:
+    """The fit at a mode, with the expansion there.
+
+    Args:
+        problem: in which the effects are live.
+        mode: of the marginal density.
+        free: what is fitted.
+        freed: frees a fit from local optima; what leads off the mode is not taken.
+    """
     whole = problem.with_volume(mode.volume)
-    found = fit(whole, mode.x, free.effects)
-    if height_at(problem, found.x, free)[1] < mode.height - ARRIVED:
+    found = freed(whole, fit(whole, mode.x, free.effects))
+    if height_at(problem, found.x, free)[1] < mode.height - _ARRIVED:
         found = replace(fit(whole, mode.x, free.effects, steps=0), converged=mode.arrived)
     return replace(found, volume=mode.volume)
 
@@ -125,7 +134,7 @@ def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Arou
             if value > height:
                 best, highest = trial, value
                 break
-        if highest - height < ARRIVED:
+        if highest - height < _ARRIVED:
             return Mode(here, height, volume, arrived=True)
         here, height = best, highest
     return Mode(here, height, _expanded(problem, here, free), arrived=False)

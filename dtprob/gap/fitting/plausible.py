@@ -9,12 +9,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Final
 
-import jax
 import numpy as np
-import numpyro.distributions as dist
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
-from scipy import special, stats
+from scipy import special
 
 from dtprob.effects.effect import Effect
 
@@ -22,8 +20,6 @@ SCALES: Final = np.geomspace(1e-4, 1.0, 25)
 """Prior scales, as shares of the largest plausible one."""
 WHOLE: Final = 10 / 7
 """Size at which a share is whole, in standard deviations of its prior, which is 0.7 wide."""
-_PRIOR_DRAWS: Final = 4001
-"""Draws that tell how far a prior without a variance reaches."""
 LARGE: Final = np.array([-2.0, -WHOLE, -0.7, 0.7, WHOLE, 2.0])
 """Large sizes to try, in standard deviations of the prior."""
 
@@ -108,31 +104,9 @@ def _terms_with_places(
     return terms
 
 
-def prior_scale(prior: dist.Distribution, null: float = 0.0) -> np.ndarray:
-    """How far from the null a prior puts a size: the root mean square, or what a normal one of the same median has.
-
-    Args:
-        prior: of one parameter.
-        null: its value without the effect.
-    """
-    base = prior
-    while isinstance(base, dist.ExpandedDistribution | dist.Independent):
-        base = base.base_dist
-    if isinstance(base, dist.Normal | dist.HalfNormal | dist.StudentT | dist.Cauchy | dist.HalfCauchy):
-        return np.asarray(base.scale)
-    try:
-        square = np.asarray(prior.variance) + (np.asarray(prior.mean) - null) ** 2
-    except NotImplementedError:
-        square = np.full(prior.batch_shape + prior.event_shape, np.inf)
-    if np.isfinite(square).all():
-        return np.sqrt(square)
-    strays = np.abs(np.asarray(prior.sample(jax.random.key(0), (_PRIOR_DRAWS,))) - null)
-    return np.median(strays, axis=0) / stats.norm.ppf(0.75)
-
-
 def scales(effect: Effect) -> Float[np.ndarray, " n"]:
     """Prior standard deviation of each of an effect's parameters, flat."""
-    return _flat(effect, [prior_scale(p.prior, p.null) for p in effect.parameters])
+    return _flat(effect, [p.scale for p in effect.parameters])
 
 
 def nulls(effect: Effect) -> Float[np.ndarray, " n"]:

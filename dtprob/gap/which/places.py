@@ -21,7 +21,7 @@ from scipy import stats
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.plausible import is_one_sided, nulls, places, prior_scale
+from dtprob.gap.fitting.plausible import is_one_sided, nulls, places
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.tails import LOG_SMALLEST, any_of, effective_tests, family_wise, gamma_tail
 from dtprob.gap.which.directions import surroundings
@@ -183,6 +183,4 @@ def _at(effect: Effect, point: Float[np.ndarray, " parameter"]) -> Effect:
 def _moved(parameter: Parameter, to: float) -> Parameter:
     if not parameter.tried:
         return parameter
-    return replace(
-        parameter, prior=dist.Normal(to, float(prior_scale(parameter.prior, parameter.null))), null=to
-    )
+    return replace(parameter, prior=dist.Normal(to, float(parameter.scale)), null=to)

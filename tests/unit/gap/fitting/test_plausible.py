@@ -12,7 +12,6 @@ from dtprob.gap.fitting.plausible import (
     log_bayes_factor,
     mixing_gain,
     nulls,
-    prior_scale,
     scales,
     sides,
 )
@@ -132,10 +131,12 @@ def test_the_prior_of_a_place_is_not_mixed():
     ],
 )
 def test_how_far_a_prior_puts_a_size(prior, null, scale):
-    assert np.asarray(prior_scale(prior, null)) == pytest.approx(scale, rel=1e-3)
+    assert Parameter("p", prior, null).scale == pytest.approx(scale, rel=1e-3)
 
 
 def test_how_far_a_prior_without_moments_puts_a_size():
     moved = dist.TransformedDistribution(dist.Normal(0.0, 1.0), AffineTransform(0.0, 8.0))
-    assert float(prior_scale(moved)) == pytest.approx(8.0, rel=0.05)
-    assert float(prior_scale(dist.Pareto(1.0, 1.5))) == pytest.approx(2 ** (1 / 1.5) / 0.6745, rel=0.05)
+    assert float(Parameter("p", moved).scale) == pytest.approx(8.0, rel=0.05)
+    assert float(Parameter("p", dist.Pareto(1.0, 1.5)).scale) == pytest.approx(
+        2 ** (1 / 1.5) / 0.6745, rel=0.05
+    )
