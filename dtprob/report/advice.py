@@ -67,6 +67,7 @@ ADVICE: Mapping[str, str] = {
     "device_disconnected": "take the device out of the twin",
     "arrival_rate_shift": "set the packet arrival rate to the estimate",
     "bursty_traffic": "let packets arrive in bursts instead of independently",
+    "closed_loop_traffic": "let a source wait for the acknowledgement of its last packet",
     "cross_cluster_traffic": "let the traffic of the two clusters depend on each other",
     "reception_shift": "set the reception probability to the estimate",
     "capture": "let the strongest packet survive a collision",

@@ -16,6 +16,7 @@ from dtprob.effects.network.laws import (
     from_then_on,
     joined,
     last_arrival,
+    last_delivery,
     mixed_at,
     of_device,
     progress,
@@ -146,6 +147,32 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
     return effects
 
 
+def closed_loop_traffic(sites: Sites, data: Data) -> list[Effect]:
+    """A device's source waits for an acknowledgement: packets come more often, or less, after a delivery."""
+    clusters = _clusters(sites, data)
+    if clusters is None:
+        return []
+    effects: list[Effect] = []
+    for device in range(clusters.devices):
+
+        def answer(value: Any, p: Mapping[str, Any], context: Mapping[str, Any], device: int = device) -> Any:
+            delivered = last_delivery(context, clusters, device)
+            return of_device(value, clusters, device, p["log_odds"] * delivered[..., None])
+
+        effects.append(
+            Effect(
+                "closed_loop_traffic",
+                {"arrival_logits": answer},
+                (normal("log_odds", 1.0),),
+                instance=f"device_{device}",
+                physics=f"The odds of a packet of device {device} change in the slot after one of its own was delivered.",
+                source="Closed-loop sources: Schroeder, Wierman and Harchol-Balter, NSDI (2006).",
+                requires=("clusters", "acknowledged"),
+            )
+        )
+    return effects
+
+
 def cross_cluster_traffic(sites: Sites, data: Data) -> list[Effect]:
     """Arrivals of devices in different clusters depend on one another."""
     clusters = _clusters(sites, data)
@@ -249,6 +276,7 @@ FAMILIES: Final[dict[str, Family]] = {
     "device_disconnected": device_disconnected,
     "arrival_rate_shift": arrival_rate_shift,
     "bursty_traffic": bursty_traffic,
+    "closed_loop_traffic": closed_loop_traffic,
     "cross_cluster_traffic": cross_cluster_traffic,
     "drift": drift,
 }

@@ -168,6 +168,13 @@ def last_arrival(
     return _has(data["previous"], clusters, device)
 
 
+def last_delivery(
+    data: Mapping[str, Any], clusters: ClustersLike, device: int
+) -> Float[Array, "episode slot"]:
+    """1 where a packet of the device was delivered in the slot before, else 0."""
+    return _has(data["acknowledged"], clusters, device)
+
+
 def same_arrival(
     data: Mapping[str, Any], clusters: ClustersLike, device: int
 ) -> Float[Array, "episode slot"]:

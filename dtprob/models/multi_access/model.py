@@ -66,6 +66,7 @@ def multi_access(
     clusters: Clusters,
     traffic: Traffic = "memoryless",
     concentration: float = 0.01,
+    acknowledged: Int[Array, "episode slot cluster"] | None = None,  # noqa: ARG001 -- read by effects
     arrivals: Int[Array, "episode slot cluster"] | None = None,
     deliveries: Int[Array, "episode slot"] | None = None,
     successes: Int[Array, "episode slot device"] | None = None,
@@ -84,6 +85,8 @@ def multi_access(
         clusters: the devices whose arrivals are drawn together.
         traffic: "markov" where arrivals depend on the cluster's last ones.
         concentration: of the Dirichlet priors of all tables.
+        acknowledged: whose packets were delivered in the slot before, numbered as `previous`. The tables do not depend on
+            it; traffic that waits for an acknowledgement is an effect, `closed_loop_traffic`.
         arrivals: joint arrivals of each cluster at the end of the slot.
         deliveries: number of packets delivered in the slot.
         successes: 1 where a device's packet was delivered.

@@ -29,7 +29,7 @@ def records(
             diagnosis, a monitor or a held-out score looks.
 
     Returns:
-        `sending`, `previous`, `valid`, `arrivals`, `deliveries`, `successes`, and `clusters` as `Clusters`.
+        `sending`, `previous`, `acknowledged`, `valid`, `arrivals`, `deliveries`, `successes`, and `clusters` as `Clusters`.
 
     Raises:
         InputError: devices in the log and in the clusters that do not match, a window below 1, or a buffer that the
@@ -44,10 +44,10 @@ def records(
         raise InputError("window", "1 slot or more", str(window), "Give a positive number")
     _check_capacity(log, capacity)
     row, place, episodes = _windows(log, window)
-    previous = np.where(follows(log)[:, None], np.roll(log.arrival, 1, axis=0), 0)
     columns = {
         "sending": (log.action > 0) & (log.buffer > 0),
-        "previous": previous @ known.weight.T,
+        "previous": _slot_before(log, log.arrival) @ known.weight.T,
+        "acknowledged": _slot_before(log, log.ack) @ known.weight.T,
         "valid": np.ones(len(log.slot), dtype=bool),
         "arrivals": log.arrival @ known.weight.T,
         "deliveries": log.ack.sum(axis=1),
@@ -96,6 +96,11 @@ def priors(
         "log_arrival": np.where(clusters.arrival_allowed(memory=memory), concentration, 0.0),
         "log_reception": np.where(clusters.reception_allowed(), concentration, 0.0),
     }
+
+
+def _slot_before(log: NetworkLog, values: Int[np.ndarray, "row device"]) -> Int[np.ndarray, "row device"]:
+    """What each row's slot before it held, 0 at the start of an episode."""
+    return np.where(follows(log)[:, None], np.roll(values, 1, axis=0), 0)
 
 
 def _windows(log: NetworkLog, window: int) -> tuple[Int[np.ndarray, " row"], Int[np.ndarray, " row"], int]:

@@ -34,6 +34,7 @@ TABLES = {
 }
 SHOWN = [
     "device_disconnected[device_1]", "arrival_rate_shift", "bursty_traffic[device_2]", "bursty_traffic[each_window]",
+    "closed_loop_traffic[device_1]",
     "cross_cluster_traffic[0_with_2]", "cross_cluster_traffic[3_to_1]", "drift[device_0]", "drift[reception]",
     "drift[device_0_falling]",
     "reception_shift[2_senders]", "capture", "near_far[device_0]", "bursty_channel", "bursty_channel[each_window]",
@@ -98,6 +99,21 @@ def test_bursts_keep_the_load_of_a_device_and_its_neighbour_as_it_was(offered, d
         np.testing.assert_allclose(one[[2, 3]].sum(), before[[2, 3]].sum(), atol=1e-9)
     np.testing.assert_allclose(given[True][[1, 3]].sum(), 0.25 * with_ + 0.75, atol=1e-9)
     np.testing.assert_allclose(given[False][[1, 3]].sum(), 0.25 * with_, atol=1e-9)
+
+
+def test_a_source_in_a_closed_loop_generates_more_after_its_own_delivery_and_only_then(offered, data):
+    before = law(data)[0, 0, 0]
+    after = law(data, offered["closed_loop_traffic[device_1]"], log_odds=jnp.log(3.0))
+    delivered = (np.asarray(data["acknowledged"])[..., 0] & 1) > 0
+    assert 0 < delivered.sum() < delivered.size
+    np.testing.assert_allclose(
+        after[~delivered][:, 0], np.broadcast_to(before, (np.sum(~delivered), 4)), atol=1e-12
+    )
+    answered = after[delivered][:, 0]
+    for has, has_not in ((1, 0), (3, 2)):  # without and with a packet of its neighbour
+        np.testing.assert_allclose(answered[:, has] / answered[:, has_not], 3 * before[has] / before[has_not])
+    np.testing.assert_allclose(answered[:, [2, 3]].sum(-1), before[[2, 3]].sum(), atol=1e-9)
+    np.testing.assert_allclose(after[..., 1, :], law(data)[..., 1, :], atol=1e-12)  # the other cluster
 
 
 def test_a_device_falls_silent_part_of_the_way():

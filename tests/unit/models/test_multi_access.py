@@ -46,6 +46,9 @@ def test_windows_keep_every_slot_and_its_past(log):
     joint = 2 * log.arrival[:, ::2] + log.arrival[:, 1::2]
     assert np.array_equal(arguments["arrivals"][valid], joint)
     assert np.array_equal(arguments["previous"][valid][1:], joint[:-1])
+    delivered = 2 * log.ack[:, ::2] + log.ack[:, 1::2]
+    assert np.array_equal(arguments["acknowledged"][valid][1:], delivered[:-1])
+    assert not arguments["acknowledged"][0, 0].any()
 
 
 def test_counts(log):
