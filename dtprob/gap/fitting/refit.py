@@ -108,7 +108,7 @@ def starting_points(
     """
     if effect.kind == "variance":
         return []
-    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    index = problem.layout.of(effect)
     scale, sided = scales(effect), sides(effect)
     x = _at_null(problem, x, [effect.name])
     one_step = x.copy()
@@ -156,7 +156,7 @@ def _along(
 
 def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[np.ndarray]:
     """Large sizes of an effect that fit best with the clusters' angles found anew; none where `swept` has nothing to do."""
-    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    index = problem.layout.of(effect)
     scale, sided = scales(effect), sides(effect)
     found: list[tuple[float, np.ndarray]] = []
     for j, position in enumerate(index[:_SWEPT]):

@@ -13,6 +13,7 @@ import numpy as np
 from numpyro.distributions import biject_to, constraints
 from numpyro.distributions.transforms import IdentityTransform
 
+from dtprob.effects.effect import Effect
 from dtprob.gap.model.own import Own
 from dtprob.models.declaration import base_constraint
 
@@ -70,6 +71,10 @@ class Layout:
     def indices(self, names: Iterable[str]) -> np.ndarray:
         """Positions of some blocks that are not local to clusters, one after another."""
         return np.concatenate([self[name].index[0] for name in names])
+
+    def of(self, effect: Effect) -> np.ndarray:
+        """Positions of a live mean effect's parameters, one after another."""
+        return self.indices(effect.site_name(p.name) for p in effect.parameters)
 
     def put(self, x: np.ndarray, name: str, value: Any) -> None:
         """Write the value of one block into x."""

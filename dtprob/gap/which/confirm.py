@@ -71,7 +71,7 @@ def _lowest(problem: Problem, means: Sequence[Effect], fitted: fitting.Fit) -> n
     """The smallest value of each global coordinate: the null of one-sided parameters."""
     lowest = np.full(problem.dimension, -np.inf)
     for effect in means:
-        index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+        index = problem.layout.of(effect)
         lowest[index] = np.where(sides(effect), nulls(effect), -np.inf)
     return lowest[fitted.global_index]
 
@@ -131,5 +131,5 @@ def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) 
 def _plausible(effect: Effect, fitted: fitting.Fit, problem: Problem) -> bool:
     if effect.kind == "variance":
         return fitted.spread[effect.name] <= 4 * float(scales(effect)[sizes(effect)].max())
-    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    index = problem.layout.of(effect)
     return bool(np.all(np.abs(fitted.x[index] - nulls(effect)) <= 4 * scales(effect)))

@@ -167,7 +167,7 @@ def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], setti
 
 def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:
     x = problem.translate(found.x, scanned)
-    x[problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)] = found.parameters
+    x[problem.layout.of(effect)] = found.parameters
     return x
 
 
