@@ -72,9 +72,9 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     return polish(problem, best, added) if added and not polished else best
 
 
-def followed(problem: Problem, fitted: fitting.Fit) -> fitting.Fit:
+def followed(problem: Problem, fitted: fitting.Fit, patience: int = _PATIENCE) -> fitting.Fit:
     """Where a fit that still climbs leads: along a bent ridge, as of a path's delay and its gain's phase, it crawls."""
-    for _ in range(0 if fitted.converged else _PATIENCE):
+    for _ in range(0 if fitted.converged else patience):
         further = fitting.fit(problem, fitted.x, fitted.effects, spread=fitted.spread)
         gain, fitted = further.log_posterior - fitted.log_posterior, further
         if fitted.converged or gain < _SAME:

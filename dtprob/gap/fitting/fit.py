@@ -17,7 +17,7 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.active import LOG_2PI, Active, activate
 from dtprob.gap.fitting.density import moved, system_at, value_of, volume_of
-from dtprob.gap.fitting.newton import System, newton_step, positive
+from dtprob.gap.fitting.newton import NewtonStep, System, newton_step, positive
 from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
 from dtprob.gap.model.problem import Problem
@@ -27,6 +27,8 @@ _TRIES: Final = 8
 _SETTLED: Final = 0.01
 """Change of the logarithm of a field's standard deviation below which it stands."""
 _LEAST_DAMPING: Final = 1e-12
+_FARTHEST: Final = 10.0
+"""Standard deviations of its prior that an unknown of the base model moves in a step at most."""
 _STUCK: Final = 1e3
 """Damping beyond which a fit has arrived, whatever its quadratic promises."""
 
@@ -136,11 +138,12 @@ def _better(
     tolerance: float,
 ) -> _Trial:
     """The first of ever more damped steps that raises the log posterior, or the last that did not."""
-    lowest = _lowest(problem, active, x)
+    lowest, farthest = _lowest(problem, active, x), _farthest(problem, active)
     trial = _Trial(x, value, 0.0, damping)
     for _ in range(_TRIES):
         step = newton_step(system, damping, lowest)
-        shifted = moved(active, x, step)
+        share = min(1.0, 1.0 / float(np.max(np.abs(step.shared) / farthest, initial=1e-300)))
+        shifted = moved(active, x, NewtonStep(share * step.shared, share * step.local, step.gain))
         trial = _Trial(shifted, value_of(problem, active, shifted), step.gain, damping)
         if trial.value > value:
             break
@@ -156,9 +159,21 @@ def _lowest(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     lowest = np.full(len(x), -np.inf)
     for effect in active.effects:
         if effect.kind == "mean":
-            index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+            index = problem.layout.of(effect)
             lowest[index] = np.where(sides(effect), nulls(effect) - x[index], -np.inf)
     return lowest[active.global_index]
+
+
+def _farthest(problem: Problem, active: Active) -> np.ndarray:
+    """How far each global coordinate may move in a step: the base model's unknowns no farther than any prior expects.
+
+    Where a likelihood is flat, as of a logarithm at minus infinity, nothing leads back.
+    """
+    deviation = problem.prior_middle[1]  # of the base model's unknowns, which are the first ones
+    farthest = np.full(problem.dimension, np.inf)
+    count = sum(block.index.size for block in problem.blocks_of(None))
+    farthest[:count] = np.where(deviation[:count] > 0, _FARTHEST * deviation[:count], np.inf)
+    return farthest[active.global_index]
 
 
 def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, converged: bool) -> Fit:
@@ -186,7 +201,7 @@ def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, conve
 
 def _mixed(problem: Problem, active: Active, x: np.ndarray, covariance: np.ndarray, effect: Effect) -> float:
     """What mixing the scale of an effect's prior adds to the log evidence."""
-    index = problem.layout.indices(effect.site_name(p.name) for p in effect.parameters)
+    index = problem.layout.of(effect)
     place = np.ix_(*[[int(np.flatnonzero(active.global_index == i)[0]) for i in index]] * 2)
     change, sided = x[index] - nulls(effect), is_one_sided(effect)
     return mixing_gain(covariance[place], change, scales(effect), one_sided=sided, places=places(effect))

@@ -35,7 +35,9 @@ _STEP: Final = 0.5
 _MATTERS: Final = 4.0
 """Squared distance of a joint mode from the marginal one, in standard deviations, from which it is not taken."""
 _RUNAWAY: Final = 10.0
-"""Standard deviations of the prior beyond which a joint mode runs away."""
+"""Standard deviations of the prior beyond which a joint mode runs away, unless it arrives at a sound one."""
+_FURTHER: Final = 5
+"""Fits by which such a mode may arrive."""
 
 
 def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lambda _: None) -> Start:
@@ -55,9 +57,9 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
         return Start(problem, fit_base(problem, key, polished=polished))
     centre, free = turned(problem, problem.prior_middle[0], problem.compiled.by_cluster), around(problem)
     starts = [centre]
-    if not has_states and not _runs_away(problem, fit(problem, centre), centre, free.scale):
+    if not has_states and not _runs_away(problem, fit(problem, centre), centre, free):
         joint = fit_base(problem, key, polished=polished)
-        if not _runs_away(problem, joint, centre, free.scale):
+        if not _runs_away(problem, joint, centre, free):
             if _is_near_the_marginal_one(problem, joint, free):
                 return Start(problem, joint)
             starts.append(joint.x)
@@ -68,6 +70,7 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     return Start(found.within(problem), found)
 
 
+@np.errstate(over="ignore", invalid="ignore")  # a runaway's curvatures may overflow: it is not near
 def _is_near_the_marginal_one(problem: Problem, joint: Fit, free: Around) -> bool:
     """Whether a joint mode is no farther from the marginal one than what the data tell apart."""
     near = np.minimum(STEP * free.scale, _STEP * np.sqrt(np.diag(joint.covariance)))
@@ -76,10 +79,17 @@ def _is_near_the_marginal_one(problem: Problem, joint: Fit, free: Around) -> boo
     return bool(slope @ joint.covariance @ slope < _MATTERS)
 
 
-def _runs_away(problem: Problem, first: Fit, centre: np.ndarray, scale: np.ndarray) -> bool:
-    """Whether a joint mode that was sought from a sound point lies where no prior expects it, or nowhere."""
-    if not np.isfinite(terms_of(problem, activate(problem), centre)).all():
+def _runs_away(problem: Problem, first: Fit, centre: np.ndarray, free: Around) -> bool:
+    """Whether a joint mode that was sought from a sound point lies where no prior expects it, or nowhere.
+
+    What data say of a twin that is far off lies there too: such a fit arrives, and the marginal mode is where it does.
+    """
+    if first.converged or not np.isfinite(terms_of(problem, activate(problem), centre)).all():
         return False
-    away = np.abs(first.x - centre)[first.global_index] / scale
-    lost = not np.isfinite(first.log_posterior)
-    return not first.converged and (lost or bool(away.max() > _RUNAWAY))
+    if not np.isfinite(first.log_posterior):
+        return True
+    away = np.abs(first.x - centre)[first.global_index] / free.scale
+    if away.max() <= _RUNAWAY:
+        return False
+    arrived = followed(problem, first, patience=_FURTHER)
+    return not (arrived.converged and _is_near_the_marginal_one(problem, arrived, free))

@@ -15,7 +15,6 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
-from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import Fit, fit
@@ -30,11 +29,15 @@ _SHARES: Final = (1.0, 0.5, 0.25, 0.1, 0.03)
 _ARRIVED: Final = 0.01
 """Nats by which a round has to be better."""
 _FAR: Final = 1.0
-"""Standard deviations of the prior that a coordinate moves in a round at most."""
+"""Standard deviations of the prior that a coordinate moves in the first round at most."""
+_FARTHER: Final = 4.0
+"""Times as far in the next round, where a whole move was a gain."""
 STEP: Final = 0.1
 """Of the differences, in standard deviations of a coordinate's prior."""
 _DENSE: Final = 12
 """Shared coordinates up to which second differences between two of them are taken too."""
+_SLIGHT: Final = 0.01
+"""Nats by which the volume bends along a coordinate, over its posterior, below which it is not looked at with others."""
 _EXACT: Final = 1e-7
 _FAITHFUL: Final = 0.5
 """Nats that the expansion may be off at a fit."""
@@ -72,14 +75,10 @@ def around(problem: Problem, names: Sequence[str] = ()) -> Around:
     scale = [np.maximum(problem.prior_middle[1][index[0]], 1e-12)]
     lowest = [np.full(len(index[0]), -np.inf)]
     for effect in (e for e in problem.live if e.name in names):
-        index.append(_positions(problem, effect))
+        index.append(problem.layout.of(effect))
         scale.append(scales(effect))
         lowest.append(np.where(sides(effect), nulls(effect), -np.inf))
     return Around(tuple(names), *(np.concatenate(part) for part in (index, scale, lowest)))
-
-
-def _positions(problem: Problem, effect: Effect) -> np.ndarray:
-    return np.asarray(problem.layout.indices(effect.site_name(p.name) for p in effect.parameters))
 
 
 def faithful(problem: Problem, fitted: Fit, starts: Sequence[np.ndarray]) -> Fit:
@@ -122,17 +121,18 @@ def fitted_at(
 
 def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Around) -> Mode:
     """The mode of the marginal density, from a point and the log density there."""
+    reach = _FAR
     for _ in range(_ROUNDS):
         volume = _expanded(problem, here, free)
         move = (fit(problem.with_volume(volume), here, free.effects).x - here)[free.index]
-        move *= min(1.0, _FAR / float(np.max(np.abs(move) / free.scale, initial=1e-300)))
+        move *= min(1.0, reach / float(np.max(np.abs(move) / free.scale, initial=1e-300)))
         best, highest = here, height
         for share in _SHARES:
             trial = here.copy()
             trial[free.index] += share * move
             trial, value = height_at(problem, trial, free)
             if value > height:
-                best, highest = trial, value
+                best, highest, reach = trial, value, reach * _FARTHER if share == 1.0 else _FAR
                 break
         if highest - height < _ARRIVED:
             return Mode(here, height, volume, arrived=True)
@@ -189,10 +189,30 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
     up, down = beside(problem, at, free, step)
     slope = (up - down) / 2
     bend = (up + down - 2 * middle[:, None])[:, :, None] * np.eye(n)
-    for i, j in combinations(range(n if n <= _DENSE else 0), 2):
+    straight = np.abs(np.nan_to_num(up + down - 2 * middle[:, None], posinf=0.0, neginf=0.0)).sum(axis=0)
+    for i, j in combinations(_bent(problem, x, free, straight / step**2) if n <= _DENSE else (), 2):
         both = sum(_volume_at(problem, at, free.index, sign * (units[i] + units[j])) for sign in (1.0, -1.0))
         bend[:, i, j] = bend[:, j, i] = both / 2 - middle - (bend[:, i, i] + bend[:, j, j]) / 2
     value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
     values, vectors = np.linalg.eigh(bend)
     bend = np.einsum("cij,cj,ckj->cik", vectors, np.minimum(values, 0.0), vectors)
     return Volume(free.index, at[free.index], value, slope / step, bend / np.outer(step, step))
+
+
+def _bent(problem: Problem, x: np.ndarray, free: Around, bend: np.ndarray) -> list[int]:
+    """The fitted coordinates along which the volume bends enough to matter; all of them beside states.
+
+    Two that bend by a and b nats over their posteriors bend together by no more than the root of a b, where the volume
+    bends one way in all directions.
+
+    Args:
+        problem: whose volume it is.
+        x: where.
+        free: what is fitted.
+        bend: size of the second derivative along each coordinate (shared,), over all clusters.
+    """
+    if len(free.index) < 2 or states(problem).blocks:
+        return list(range(len(free.index)))
+    joint = fit(problem.with_volume(None), x, free.effects, steps=0)
+    place = np.searchsorted(joint.global_index, free.index)
+    return [int(i) for i in np.flatnonzero(bend * np.diag(joint.covariance)[place] > _SLIGHT)]

@@ -277,3 +277,32 @@ def test_positive_can_be_inverted_where_a_coordinate_bends_only_with_others(own)
         [[own, 3.0, 1.0, 2.0], [3.0, 2.0, 0.5, 1.0], [1.0, 0.5, 1.0, 1.0], [2.0, 1.0, 1.0, 3.0]]
     )
     assert np.all(np.isfinite(np.linalg.inv(positive(matrix))))
+
+
+def test_unknowns_that_go_together_arrive_however_far_they_have_to_go():
+    """Steps end ten standard deviations of a prior away; cut coordinate by coordinate they led downhill, as if arrived."""
+
+    def far(x, y=None):
+        level, slope = numpyro.sample("a", dist.Normal(0.0, 1.0)), numpyro.sample("b", dist.Normal(0.0, 2.0))
+        mean = numpyro.deterministic("mean", level + slope * x)
+        with numpyro.plate("row", len(x)):
+            numpyro.sample("y", dist.Normal(mean, 0.05), obs=y)
+
+    rng = np.random.default_rng(0)
+    x = rng.uniform(0.7, 1.3, 400)
+    y = 100 - 85 * x + 0.05 * rng.normal(size=400)
+    found = fitting.fit(Problem(far, {"x": jnp.asarray(x), "y": jnp.asarray(y)}, [], "row"), np.zeros(2))
+    design = np.stack([np.ones(400), x], axis=1)
+    precision = design.T @ design / 0.05**2 + np.diag([1.0, 0.25])
+    np.testing.assert_allclose(found.x, np.linalg.solve(precision, design.T @ y / 0.05**2), atol=1e-3)
+    assert found.converged
+
+
+def test_the_farthest_step_knows_the_base_model_alone():
+    """What is known of the prior may come from a problem with larger live effects."""
+    sizes = Parameter("one", dist.Normal(0.0, 1.0)), Parameter("two", dist.Normal(0.0, 1.0))
+    wide = Effect("wide", {"mean": lambda value, p, _: value + p["one"] + p["two"] * value}, sizes)
+    start = Problem(line, draw("line"), [wide, bend()]).with_live(["wide"])
+    fitting.fit(start, start.null(), ("wide",))
+    other = start.with_live([bend().name])
+    assert fitting.fit(other, other.null(), (bend().name,)).converged

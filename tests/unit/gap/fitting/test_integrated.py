@@ -11,11 +11,13 @@ from scipy import optimize, stats
 from dtprob.effects import Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
+from dtprob.gap.fitting import marginal_mode
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.fitting.integrated import based
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
+from dtprob.models.complex_normal import ComplexNormal
 
 KEY = jax.random.key(0)
 SETTINGS = Settings(replicates=100, site_replicates=39, candidates=2)
@@ -172,3 +174,35 @@ def test_a_broken_model_with_states_says_what_breaks():
     data["level"] = data["level"].at[3, 1].set(jnp.nan)
     with pytest.raises(InputError, match=r"data level: expected finite values"):
         based(Problem(levels, data, [added("slope", lambda c: c["place"])]), KEY)
+
+
+def turned_tones(tone, signal=None):
+    """Tones that come with a phase of each link, in noise that is known to a tenth."""
+    gain = numpyro.sample("gain", dist.LogNormal(0.0, 0.5))
+    slope = numpyro.sample("slope", dist.Normal(0.0, 0.5))
+    noise = numpyro.sample("noise", dist.LogNormal(jnp.log(1e-4), 0.1))
+    with numpyro.plate("link", tone.shape[0], dim=-2):
+        phase = numpyro.sample("phase", dist.VonMises(0.0, 0.01))
+        with numpyro.plate("tone", tone.shape[1], dim=-1):
+            mean = gain * (1 + slope * tone) * jnp.exp(1j * phase)
+            expected = numpyro.deterministic("expected", mean)
+            numpyro.sample("signal", ComplexNormal(expected, noise), obs=signal)
+
+
+def test_a_gap_that_no_prior_of_the_noise_expects_is_no_runaway(monkeypatch):
+    """A twin far off puts the noise 60 standard deviations from its prior; expansions on the way there took minutes."""
+    rng = np.random.default_rng(0)
+    tone = np.tile(np.linspace(-1, 1, 16), (12, 1))
+    phase = rng.uniform(-np.pi, np.pi, (12, 1))
+    signal = (1 + 0.5 * np.sin(9 * tone)) * np.exp(1j * phase)
+    expansions = []
+    monkeypatch.setattr(
+        marginal_mode, "_expanded", lambda *a: expansions.append(a) or pytest.fail("expanded")
+    )
+    problem = Problem(turned_tones, {"tone": jnp.asarray(tone), "signal": jnp.asarray(signal)}, [], "link")
+    start = based(problem, KEY)
+    assert not expansions
+    (noise,) = start.fitted.x[start.problem.layout.indices(["noise"])]
+    assert noise > np.log(1e-4) + 10 * 0.1
+    turn = start.fitted.x[start.problem.layout["phase"].index[:, 0]] - phase[:, 0]
+    np.testing.assert_allclose(np.exp(1j * turn), 1.0, atol=0.3)
