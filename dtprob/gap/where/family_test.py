@@ -18,6 +18,12 @@ _HEAVIEST: Final = 6.0
 """Kurtosis of a score over replicates up to which the largest of several tells something; 3 of a normal one."""
 _MOSTLY: Final = 0.9
 """Share of the entries that have to be no heavier."""
+_NORMAL: Final = 3.6
+_WEIGHED: Final = 3.0
+"""Kurtosis from which on an entry's square counts less, since its tails reach farther, and by which power of its excess."""
+_ALONE: Final = 0.5
+"""Share of an entry's squares that the other replicates have at least where one is judged by its kurtosis in these. The
+data count for no more than a replicate can."""
 _OTHERS: Final = 1e-9
 """Share of an entry's variance below which the other replicates tell nothing of it: rare outcomes move but one."""
 _SEEN: Final = 0.25
@@ -66,42 +72,70 @@ def family_test(family: Family, scores: np.ndarray, normal: np.ndarray | None = 
     if not alive.any():
         return FamilyTest(family, 1.0, np.ones(n), first, total / n)
     most = np.inf if normal is None else _RARE
-    summed, largest, steady = _against_the_others(scores[1:], np.where(alive, total, np.inf), most)
+    summed, largest, steady, weight = _against_the_others(scores[1:], np.where(alive, total, np.inf), most)
     statistic, own = (n - 1) * summed, scores[0, alive] ** 2 / total[alive]
     counted = np.where(steady[alive], own, np.minimum(own, most / n))
     p = variance_ratio_tail(
         np.append(statistic, n * counted.sum()), float(statistic.mean()), float(statistic.var()), n - 1
     )
     if steady.sum() >= max(_SEVERAL, _MOSTLY * alive.sum()):
-        p = np.minimum(p, largest_tail(np.append((n - 1) * largest, n * own[steady[alive]].max())))
+        weighed = np.minimum(scores[0, steady] ** 2 / total[steady], 1 / _ALONE - 1) * weight[steady]
+        p = np.minimum(p, largest_tail(np.append((n - 1) * largest, n * weighed.max())))
     return FamilyTest(family, float(p[-1]), p[:-1], first, total / n)
+
+
+class _Null(NamedTuple):
+    """What replicates make of a family.
+
+    Attributes:
+        summed: each replicate's squared scores, over the sum of the others', summed over the entries.
+        largest: the largest of them, weighed.
+        steady: entries that do not move in few replicates only, (entry,).
+        weight: of an entry's square among the largest, (entry,).
+    """
+
+    summed: Float[np.ndarray, " replicate"]
+    largest: Float[np.ndarray, " replicate"]
+    steady: Bool[np.ndarray, " entry"]
+    weight: Float[np.ndarray, " entry"]
 
 
 def _against_the_others(
     scores: Float[np.ndarray, "replicate entry"], total: Float[np.ndarray, " entry"], most: float
-) -> tuple[Float[np.ndarray, " replicate"], Float[np.ndarray, " replicate"], Bool[np.ndarray, " entry"]]:
-    """Each replicate's squared scores over the sum of the others', a few entries at a time: their sum, and the largest.
+) -> _Null:
+    """Each replicate beside the others as the data are beside all, a few entries at a time.
 
-    The largest is that of the steady entries, which are returned, too: others move in few replicates only.
+    Which entries count among the largest of a replicate, and how much, the others say: were it judged by a kurtosis that it
+    is part of, no replicate could be as far out as the data can.
 
     Args:
         scores: of the replicates.
         total: sum of their squares, infinite where an entry does not count.
         most: of a squared score over its variance that the sum takes from an entry that is not steady.
     """
-    summed, largest = np.zeros((2, len(scores)))
-    steady = np.zeros(len(total), bool)
-    width = max(_AT_ONCE // len(scores), 1)
+    n = len(scores)
+    found = _Null(np.zeros(n), np.zeros(n), np.zeros(len(total), bool), np.ones(len(total)))
+    width = max(_AT_ONCE // n, 1)
     for start in range(0, len(total), width):
-        own = scores[:, start : start + width] ** 2
-        others = total[start : start + width] - own
-        alone = others < _OTHERS * total[start : start + width]
+        part = slice(start, min(start + width, len(total)))
+        own, whole, counts = scores[:, part] ** 2, total[part], total[part] < np.inf
+        others, fourth = whole - own, (own**2).sum(0)
+        alone = others < _OTHERS * whole
         if alone.any():
             own[alone], others[alone] = 0.0, 1.0
-        part = slice(start, start + own.shape[1])
-        steady[part] = (_HEAVIEST * total[part] ** 2 > len(scores) * (own**2).sum(0)) & (total[part] < np.inf)
+        kurtosis = n * fourth / np.where(counts, whole, 1.0) ** 2
+        found.steady[part] = (kurtosis < _HEAVIEST) & counts
+        found.weight[part] = _weight(kurtosis)
+        beside = (n - 1) * (fourth - own**2) / np.where(counts, others, 1.0) ** 2
         ratio = own / others
-        counted = np.where(steady[part], ratio, np.minimum(ratio, most / (len(scores) - 1)))
-        summed += (counted if most < np.inf else ratio).sum(1)
-        np.maximum(largest, np.max(ratio, axis=1, where=steady[part], initial=0.0), out=largest)
-    return summed, largest, steady
+        capped = np.where(found.steady[part], ratio, np.minimum(ratio, most / (n - 1)))
+        np.add(found.summed, (capped if most < np.inf else ratio).sum(1), out=found.summed)
+        judged = (beside < _HEAVIEST) & (others > _ALONE * whole) & counts
+        weighed = np.max(ratio * _weight(beside), axis=1, where=judged, initial=0.0)
+        np.maximum(found.largest, weighed, out=found.largest)
+    return found
+
+
+def _weight(kurtosis: np.ndarray) -> np.ndarray:
+    """Of a square among the largest, by the entry's kurtosis."""
+    return (_NORMAL / np.maximum(kurtosis, _NORMAL)) ** _WEIGHED
