@@ -19,11 +19,20 @@ ORDER: Final = 4
 """Half waves of what counts as smooth."""
 _FINEST: Final = 512
 """Half waves of the finest ripple that is looked for."""
+_FEW: Final = 8
+_COARSE: Final = 32
+"""Columns up to which ripples are as fine as that, and half waves of the finest ones over more columns."""
 _CROSSED: Final = 3
 """Half waves along each of two columns of what varies over both."""
 _SHARES: Final = 16
 """Parts of a column between whose values steps are looked for."""
+_CENTRES: Final = 32
+_NEAREST: Final = (1 / 32, 1 / 16, 1 / 8)
+"""Places in the plane of two columns about which a compact region is looked for, and shares of the positions in one."""
 _MOST_PAIRS: Final = 6
+_GROUPS: Final = 32
+_SHARED: Final = 8
+"""Values of a real column up to which it is looked at by value too, and positions that share one of them on average."""
 _CELL: Final = 4
 """Positions in each cell of two columns, on average, from which cells may be off by an amount of their own."""
 _LONGEST: Final = 24
@@ -94,8 +103,8 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     found = columns(problem, axis, size)
     for name, column in found.items():
         if _is_ordered(column):
-            yield from over_column(name, column, _FINEST)
-        else:
+            yield from over_column(name, column, _FINEST if len(found) <= _FEW else _COARSE)
+        if _makes_groups(column):
             yield Curves(f"by {name}", grouped(np.unique(column, return_inverse=True)[1]), column=name)
     yield from _pairs(found, size)
 
@@ -108,18 +117,42 @@ def _is_ordered(column: np.ndarray) -> bool:
     return 2 * count > len(column)
 
 
+def _makes_groups(column: np.ndarray) -> bool:
+    """Whether the values of a column (size,) may be names of groups, as numbers of receivers are among real ones too."""
+    count = len(np.unique(column))
+    return not _is_ordered(column) or (count <= _GROUPS and _SHARED * count <= len(column))
+
+
 def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
     """What varies with two columns (size,) together: smooth over both, along one in each group, by groups of both."""
-    is_ordered = {name: _is_ordered(column) for name, column in found.items()}
-    smooth = [n for n, c in found.items() if is_ordered[n] and np.issubdtype(c.dtype, np.floating)]
-    made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if not is_ordered[n]}
+    made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}
+    smooth = [n for n, c in found.items() if _is_ordered(c) and np.issubdtype(c.dtype, np.floating)]
     for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
-        crossed = _waves(_rank(found[one]), 1, _CROSSED), _waves(_rank(found[other]), 1, _CROSSED)
-        products = crossed[0][:, None] * crossed[1][None]
+        first, second = (_waves(_rank(found[name]), 1, _CROSSED) for name in (one, other))
+        products = first[:, None] * second[None]
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
-    for one, other in list(itertools.product(smooth, made))[:_MOST_PAIRS]:
+        near = _neighbourhoods(np.stack([found[one], found[other]], axis=1).astype(float))
+        yield Curves(f"near a place of {one} and {other}", near, overlaps=True)
+    crossed = [(one, other) for one, other in itertools.product(smooth, made) if one != other]
+    for one, other in crossed[:_MOST_PAIRS]:
         yield Curves(f"along {one} by {other}", grouped(made[other]).multiply(_line(found[one])).tocsr())
     yield from itertools.islice(_cells(made, size), _MOST_PAIRS)
+
+
+def _neighbourhoods(place: np.ndarray) -> sparse.csr_matrix:
+    """The positions nearest to each of a few places (size, 2) that cover them evenly, in small, larger and large groups."""
+    unit = (place - place.mean(axis=0)) / place.std(axis=0)
+    size, centres = len(unit), [0]
+    distance = [np.linalg.norm(unit - unit[0], axis=1)]
+    while len(centres) < min(_CENTRES, size):
+        centres.append(int(np.argmax(np.min(distance, axis=0))))
+        distance.append(np.linalg.norm(unit - unit[centres[-1]], axis=1))
+    nearest = np.argsort(np.stack(distance), axis=1)
+    members = sorted({max(int(size * share), 2) for share in _NEAREST})
+    groups = [row[:count] for count in members for row in nearest]
+    weight = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    shape = (len(groups), size)
+    return sparse.csr_matrix((np.ones(len(weight)), (weight, np.concatenate(groups))), shape)
 
 
 def _cells(made: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:

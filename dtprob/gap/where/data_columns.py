@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Final
 
 import equinox as eqx
 import numpy as np
@@ -10,16 +11,20 @@ import numpy as np
 from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import Site
 
+_POSITION: Final = 3
+_MOST: Final = 32
+"""Columns of positions, and of tables of features, up to which each is looked along; wider ones are neither."""
+
 
 def columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
-    """Columns of the data (size,) that lie along an axis of the observations and vary; of positions each coordinate."""
+    """Columns of the data (size,) that lie along an axis of the observations and vary; of positions or features each."""
     if not any(axis in site.axes for site in problem.declaration.observed.values()):
         return {}
     found: dict[str, np.ndarray] = {}
     for name, column in _given(problem):
         if column.shape == (size,):
             found[name] = column
-        elif column.ndim == 2 and column.shape[0] == size and column.shape[1] <= 3:
+        elif column.ndim == 2 and column.shape[0] == size and _is_table(problem, column.shape):
             found |= {f"{name}[{i}]": part for i, part in enumerate(column.T)}
     real = (np.floating, np.integer, np.bool_)
     return {
@@ -27,6 +32,12 @@ def columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
         for name, column in found.items()
         if any(np.issubdtype(column.dtype, kind) for kind in real) and len(np.unique(column)) > 1
     }
+
+
+def _is_table(problem: Problem, shape: tuple[int, ...]) -> bool:
+    """Whether an array (size, n) holds positions or features, not what is known of each entry along two axes."""
+    whole = any(_is_within(shape, site.shape) for site in problem.declaration.observed.values())
+    return shape[1] <= _POSITION or (shape[1] <= _MOST and not whole)
 
 
 def whole_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:

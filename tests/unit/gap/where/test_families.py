@@ -120,6 +120,66 @@ def test_curves_are_smooth_ripples_columns_and_groups(problem):
     assert np.all(np.diff(found["along x"][0][order]) < 0)
 
 
+def test_a_table_of_features_is_looked_along_whole(problem):
+    """Of more than three columns, which were taken for no positions, none was looked along."""
+    rng = np.random.default_rng(6)
+    wide = SimpleNamespace(
+        declaration=problem.declaration,
+        data={"features": rng.normal(size=(LENGTH, 7))},
+        responses=problem.responses,
+    )
+    labels = {c.label for c in curves(wide, "row", LENGTH)}
+    assert {f"along features[{i}]" for i in range(7)} <= labels
+
+
+def test_real_numbers_that_repeat_are_looked_at_by_value_too(problem):
+    receiver = np.repeat(np.arange(8.0), 10)
+    named = SimpleNamespace(
+        declaration=problem.declaration, data={"receiver": receiver}, responses=problem.responses
+    )
+    found = {c.label: c for c in curves(named, "row", 80)}
+    assert found["by receiver"].extent == (8, 80)
+    assert "along receiver" in found
+
+
+def test_compact_regions_of_two_columns_are_groups_of_neighbours(problem):
+    found = {c.label: c for c in curves(problem, "row", LENGTH)}
+    near = found["near a place of place[0] and place[1]"]
+    assert near.overlaps
+    place = np.asarray(problem.data["place"])
+    unit = (place - place.mean(0)) / place.std(0)
+    for group in near.values.toarray()[-32:] > 0:
+        assert group.sum() == LENGTH // 8
+        apart = np.linalg.norm(unit[group][:, None] - unit[None], axis=-1)
+        # about one of its members it holds all that are nearest
+        assert any(set(np.argsort(row)[: group.sum()]) == set(np.flatnonzero(group)) for row in apart)
+
+
+def test_columns_of_a_grid_are_looked_over_together(problem):
+    grid = np.stack(np.meshgrid(np.arange(24.0), np.arange(24.0)), axis=-1).reshape(-1, 2)
+    named = SimpleNamespace(
+        declaration=problem.declaration,
+        data={"east": grid[:, 0], "north": grid[:, 1]},
+        responses=problem.responses,
+    )
+    labels = {c.label for c in curves(named, "row", len(grid))}
+    assert {"over east and north", "near a place of east and north", "by east", "along east"} <= labels
+
+
+def test_what_is_known_of_each_entry_is_no_table_of_features(problem):
+    """Readings (40, 6) with a weight each have one column of weights, not six."""
+    shape = (LENGTH, 6)
+    both = SimpleNamespace(
+        declaration=SimpleNamespace(
+            observed={"y": SimpleNamespace(axes=("row", "place"), shape=shape)},
+            sites=problem.declaration.sites,
+        ),
+        data={"weight": np.random.default_rng(7).normal(size=shape)},
+        responses=problem.responses,
+    )
+    assert not any("weight" in c.label for c in curves(both, "row", LENGTH))
+
+
 def test_a_band_of_ripples_is_called_by_its_half_waves(problem):
     found = {c.label: c for c in curves(problem, "row", LENGTH)}
     whole = found["ripple in row, 9 to 16 half waves"]
