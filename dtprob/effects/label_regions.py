@@ -29,6 +29,11 @@ _SHARED: Final = 8
 """Samples that share one of these values, on average."""
 _GROUPED: Final = 4
 """Values from which on several of them together are regions too."""
+_GROUPS: Final = 32
+"""Values up to which each may have an amount of its own."""
+_DIGITS: Final = 6
+_ALL_DIGITS: Final = 17
+"""Digits, at least, that tell any two numbers apart."""
 
 type Weight = Callable[[Any, Mapping[str, Any]], Float[Array, " sample"]]
 
@@ -68,25 +73,39 @@ def regions(data: Data) -> list[Region]:
     for index, column in _columns(data):
         values = np.unique(column)
         if len(values) <= min(_NAMED, len(column) // _SHARED):
-            found += [_at_value(index, column, float(value)) for value in values[::-1]]
+            named = zip(_written(values), values, strict=True)
+            found += [_at_value(index, column, text, float(value)) for text, value in reversed([*named])]
         if len(values) >= _GROUPED:
             found += _thirds(index, column, found)
     return found
 
 
-def _at_value(index: int, column: np.ndarray, value: float) -> Region:
+def _written(values: np.ndarray) -> list[str]:
+    """Different numbers in as few digits as keep them apart."""
+    for digits in range(_DIGITS, _ALL_DIGITS):
+        written = [f"{value:.{digits}g}" for value in values]
+        if len(set(written)) == len(values):
+            return written
+    return [repr(float(value)) for value in values]
+
+
+def _at_value(index: int, column: np.ndarray, written: str, value: float) -> Region:
     """Where a feature has one of its values."""
 
     def at(x: Any, _: Mapping[str, Any]) -> Float[Array, " sample"]:
         return (x[:, index] == value).astype(float)
 
-    text = f"where feature {index} is {value:g}"
-    return Region(f"x{index}_is_{value:g}", text, at, column == value)
+    return Region(f"x{index}_is_{written}", f"where feature {index} is {written}", at, column == value)
 
 
 def _thirds(index: int, column: np.ndarray, known: Sequence[Region]) -> Iterator[Region]:
-    """The lowest, middle and highest third of a feature, as far as they are none of the known regions."""
+    """The lowest, middle and highest third of a feature, as far as they are none of the known regions.
+
+    Where more than a third of the samples have one value, as of a meter at its end, what lies below and above it.
+    """
     low, high = (float(edge) for edge in np.quantile(column, (1 / 3, 2 / 3)))
+    if low == high:
+        low = float(max(column[column < high], default=-np.inf))
     places: dict[str, tuple[float, float]] = {
         "low": (-np.inf, low),
         "middle": (low, high),
@@ -95,7 +114,7 @@ def _thirds(index: int, column: np.ndarray, known: Sequence[Region]) -> Iterator
     is_smooth = np.unique(column, return_counts=True)[1].max() <= len(column) / _SMOOTH
     for name, (first, last) in places.items():
         inside = (column > first) & (column <= last)
-        if not inside.any() or any(np.array_equal(inside, one.inside) for one in known):
+        if inside.all() or not inside.any() or any(np.array_equal(inside, one.inside) for one in known):
             continue
         ends = f"({column[inside].min():.3g} to {column[inside].max():.3g})"
         if is_smooth:
@@ -146,10 +165,18 @@ def _soft(
     return weight, parameters
 
 
-def slopes(data: Data) -> list[Region]:
-    """Each feature itself, from -1 at its smallest to 1 at its largest value."""
-    found: list[Region] = []
+def groupings(data: Data) -> Iterator[tuple[int, np.ndarray]]:
+    """Features whose values may number things, such as receivers: by number, with the values."""
     for index, column in _columns(data):
+        values = np.unique(column)
+        if _GROUPED <= len(values) <= min(_GROUPS, len(column) // _SHARED):
+            yield index, values
+
+
+def slopes(data: Data, least: int = 2) -> list[Region]:
+    """Each feature of at least so many values itself, from -1 at its smallest to 1 at its largest one."""
+    found: list[Region] = []
+    for index, column in ((i, c) for i, c in _columns(data) if len(np.unique(c)) >= least):
         middle, half = float(column.max() + column.min()) / 2, float(np.ptp(column)) / 2
 
         def along(

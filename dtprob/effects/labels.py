@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
 from dtprob.effects.effect import FIELD, Effect
-from dtprob.effects.label_regions import Region, Weight, regions, slopes
+from dtprob.effects.label_regions import Region, Weight, groupings, regions, slopes
 
 _POINTS: Final = 64
 """Points at which the errors of an old map are drawn."""
@@ -22,7 +22,7 @@ _REACH: Final = 1.0
 
 
 def regional_bias(sites: Sites, data: Data) -> list[Effect]:
-    """The predictor is off by a constant everywhere, in a region of a feature, or ever more along a feature."""
+    """The predictor is off by a constant everywhere, in a region, or by value of a feature; or ever more along one."""
     if not offers(sites, "predicted_label"):
         return []
     unit = _unit(data)
@@ -39,7 +39,27 @@ def regional_bias(sites: Sites, data: Data) -> list[Effect]:
             requires=("x",),
         )
         for region in [everywhere, *regions(data), *slopes(data)]
-    ]
+    ] + [_by_value(index, values, unit) for index, values in groupings(data)]
+
+
+def _by_value(index: int, values: np.ndarray, unit: float) -> Effect:
+    """Each value of a feature, such as the number of a receiver, has a constant of its own."""
+
+    def shift(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        own = p[FIELD].reshape(-1)[jnp.argmin(jnp.abs(context["x"][:, index, None] - values), axis=1)]
+        return value + p["scale"] * own
+
+    return Effect(
+        "regional_bias",
+        {"predicted_label": shift},
+        (half_normal("scale", unit),),
+        instance=f"x{index}_each_value",
+        kind="variance",
+        physics=f"Labels are off by a constant of its own for each value of feature {index}, such as each receiver.",
+        source="y + s z_k, z standard normal for each value k of the feature.",
+        requires=("x",),
+        field_shape=lambda *_: (1, len(values)),
+    )
 
 
 def scale_bias(sites: Sites, data: Data) -> list[Effect]:
@@ -63,7 +83,7 @@ def scale_bias(sites: Sites, data: Data) -> list[Effect]:
 
 
 def label_noise(sites: Sites, data: Data) -> list[Effect]:
-    """Labels are noisier in a region of a feature than elsewhere."""
+    """Labels are noisier in a region of a feature than elsewhere, or ever more along a feature."""
     if not offers(sites, "label_deviation"):
         return []
 
@@ -83,7 +103,7 @@ def label_noise(sites: Sites, data: Data) -> list[Effect]:
             source="s exp(c w(x)).",
             requires=("x",),
         )
-        for region in _apart(regions(data))
+        for region in [*_apart(regions(data)), *slopes(data, least=3)]
     ]
 
 
@@ -153,8 +173,11 @@ def _spread_out(place: Float[np.ndarray, "sample feature"]) -> Float[np.ndarray,
 
 
 def _unit(data: Data) -> float:
-    """Standard deviation of the predictions: what a large bias is measured by."""
-    return max(float(np.std(np.asarray(data["prediction"], float))), 1e-12)
+    """What a large bias is measured by: how much predictions vary, or the errors' root mean square if that is larger."""
+    predicted, seen = np.asarray(data["prediction"], float), data.get("y")
+    spread = float(np.std(predicted))
+    error = 0.0 if seen is None else float(np.sqrt(np.mean((np.asarray(seen, float) - predicted) ** 2)))
+    return max(spread, error, 1e-12)
 
 
 def _added(weight: Weight) -> Any:
@@ -164,9 +187,10 @@ def _added(weight: Weight) -> Any:
     return add
 
 
+# the slope first, which acts on what is predicted: a bias beside it is in the labels' own unit
 FAMILIES: Final[dict[str, Family]] = {
-    "regional_bias": regional_bias,
     "scale_bias": scale_bias,
+    "regional_bias": regional_bias,
     "label_noise": label_noise,
     "stale_map": stale_map,
 }

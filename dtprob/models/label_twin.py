@@ -6,7 +6,7 @@ synthetic labels; a diagnosis finds it as it does for channels.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -17,6 +17,10 @@ from jaxtyping import Array, Float
 from dtprob.data import Labels
 from dtprob.errors import InputError
 from dtprob.models.declaration import model
+
+_FLAT: Final = 0.01
+_SHARE: Final = 0.1
+"""Standard deviation over root mean square of predictions below which they do not vary, and what is taken then."""
 
 
 @model(axes={"predicted_label": ("sample",), "label_deviation": ("sample",)}, cluster="sample")
@@ -37,13 +41,21 @@ def label_twin(
         The predicted labels.
     """
     del x
-    unit = jnp.maximum(jnp.std(prediction), 1e-12)
-    deviation: Any = numpyro.sample("error_deviation", dist.LogNormal(jnp.log(unit) - 1.0, 1.5))
+    deviation: Any = numpyro.sample("error_deviation", _size_of_errors(prediction))
     predicted: Any = numpyro.deterministic("predicted_label", prediction)
     spread: Any = numpyro.deterministic("label_deviation", jnp.broadcast_to(deviation, prediction.shape))
     with numpyro.plate("sample", prediction.shape[0]):
         numpyro.sample("y", dist.Normal(predicted, spread), obs=y)
     return predicted
+
+
+def _size_of_errors(prediction: Float[Array, " sample"]) -> dist.Distribution:
+    """Its prior: about a third of how much predictions vary; where they do not, anything about their own size."""
+    spread, size = jnp.std(prediction), jnp.sqrt(jnp.mean(prediction**2))
+    size = jnp.where(size > 0, size, 1.0)
+    varies = spread > _FLAT * size
+    unit = jnp.where(varies, spread, _SHARE * size)
+    return dist.LogNormal(jnp.log(unit) - 1.0, jnp.where(varies, 1.5, 4.0))
 
 
 def labelled_rows(data: Labels) -> dict[str, Any]:

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dtprob.effects.effect import Context
+from dtprob.effects.effect import FIELD, Context
 from dtprob.effects.library import catalogue
 from dtprob.models.declaration import declare
 from dtprob.models.label_twin import label_twin
@@ -42,6 +42,8 @@ def test_each_storey_is_a_region():
 def test_noise_on_one_side_is_noise_on_the_other():
     found, _ = effects(storeys(50, 70), "label_noise")
     assert {name for name in found if name.startswith("x0")} == {"x0_is_1"}
+    three, _ = effects(storeys(50, 40, 30), "label_noise")
+    assert "x0_slope" in three
     bias, _ = effects(storeys(50, 70), "regional_bias")
     assert {"x0_is_0", "x0_is_1"} <= set(bias)
 
@@ -49,7 +51,38 @@ def test_noise_on_one_side_is_noise_on_the_other():
 def test_many_storeys_are_regions_alone_and_together():
     found, _ = effects(storeys(*[20] * 6), "regional_bias")
     own = {name for name in found if name.startswith("x0")}
-    assert own == {*(f"x0_is_{k}" for k in range(6)), "x0_low", "x0_middle", "x0_high", "x0_slope"}
+    values = (f"x0_is_{k}" for k in range(6))
+    assert own == {*values, "x0_low", "x0_middle", "x0_high", "x0_slope", "x0_each_value"}
+
+
+def test_each_value_has_a_constant_of_its_own():
+    x = storeys(*[20] * 6)
+    found, data = effects(x, "regional_bias")
+    effect, sites = found["x0_each_value"], {"predicted_label": jnp.zeros(120)}
+    z = jnp.arange(6.0)
+    shifted = effect.rewrites["predicted_label"](
+        jnp.zeros(120), {"scale": 2.0, FIELD: z.reshape(1, -1)}, Context(data, sites)
+    )
+    assert np.asarray(shifted) == pytest.approx(2.0 * x[:, 0])
+
+
+@pytest.mark.parametrize(("most", "below"), [(30.0, "low"), (0.0, "high"), (15.0, "low")])
+def test_a_meter_at_its_end_parts_what_it_reads_elsewhere(most, below):
+    """Three in four samples have one value: both thirds ended there, and one region was everywhere."""
+    rng = np.random.default_rng(2)
+    column = np.where(rng.permutation(400) < 300, most, rng.uniform(0, 30, 400))
+    found, data = effects(column[:, None], "regional_bias")
+    weight = found[f"x0_{below}"].rewrites["predicted_label"](
+        jnp.zeros(400), {"bias": 1.0}, Context(data, {"predicted_label": jnp.zeros(400)})
+    )
+    expected = column > most if below == "high" else column < most
+    assert np.array_equal(np.asarray(weight) > 0.5, expected)
+
+
+def test_cells_of_large_numbers_have_names():
+    x = 130817537.0 + np.repeat(np.arange(3), 40)[:, None]
+    names = {name for name in effects(x, "regional_bias")[0] if "_is_" in name}
+    assert names == {f"x0_is_13081753{k}" for k in (7, 8, 9)}
 
 
 def test_no_region_of_single_samples():
