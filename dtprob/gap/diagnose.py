@@ -118,7 +118,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     assignment = closed.folds(problem.n_cluster, settings.folds)
     folds = list(closed.fold_fits(problem, base, assignment))
     held_before = held_after = closed.judged(problem, folds)
-    if last.fitted.effects:
+    if last is not steps[0].view:
         folds = list(closed.fold_fits(last.problem, last.fitted, assignment))
         held_after = closed.judged(last.problem, folds)
     wrong = [s for s in last.location.sites if s.p_value <= settings.level / 2]

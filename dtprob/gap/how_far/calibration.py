@@ -56,7 +56,7 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
     located = problem.rows.by_cluster(problem.rows.located) == 1
     inside, squares = [], []
     families: set[str] = set()
-    for held, part in folds:
+    for held, part, _ in folds:
         predicted = _predicted(problem, part, held)
         seen = located[held] & (predicted.sd > _ABSORBED**0.5)
         scaled, swing = predicted.error[seen] / predicted.sd[seen], predicted.swing[seen]

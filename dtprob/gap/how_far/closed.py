@@ -7,18 +7,24 @@ error is not credited to an effect. The interval is a paired bootstrap over clus
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Final, NamedTuple
 
 import jax
 import numpy as np
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy import special
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.marginal import marginal
+from dtprob.gap.fitting.refit import at_null_except
 from dtprob.gap.how_far.earlier import on_earlier_data
 from dtprob.gap.model.misses import Miss
 from dtprob.gap.model.problem import Problem
+
+_TOLD: Final = 1.0
+"""Nats that an effect changes, for better or worse, in clusters that a fold keeps, up to which they do not tell of it."""
 
 
 @dataclass(frozen=True)
@@ -31,12 +37,14 @@ class HeldOut:
         misses: by how much predictions miss each cluster, by observed site and measure.
         estimates: the effects' parameters in each fold, {site name: (fold, *shape flattened)}.
         doubt: variance of what the fits cost on earlier data, where nothing has changed since.
+        alone: clusters that are the only ones to tell of an effect; see `Fold`.
     """
 
     log_likelihood: np.ndarray
     misses: Mapping[str, Miss]
     estimates: dict[str, np.ndarray]
     doubt: float = 0.0
+    alone: Int[np.ndarray, " few"] = field(default_factory=lambda: np.zeros(0, int))
 
 
 @dataclass(frozen=True)
@@ -56,8 +64,22 @@ def folds(n_cluster: int, n_folds: int) -> np.ndarray:
     return assignment
 
 
-type Fold = tuple[np.ndarray, fitting.Fit]
-"""Which clusters (cluster,) were left out, and the fit to the others."""
+class Fold(NamedTuple):
+    """Some clusters, and a fit to the others.
+
+    Of an effect that acts in one cluster, such as the fault of one device, the others tell nothing. Its parameters are then
+    those of the fit to all, and that cluster is charged what fitting them to it gains by itself and loses on new data, a
+    nat each (Akaike, IEEE Trans. Autom. Control 19 (1974) 716), and the choice among the effects of its family.
+
+    Attributes:
+        held: the clusters (cluster,) that were left out.
+        fitted: the fit.
+        charged: nats (cluster,), 0 where the others tell.
+    """
+
+    held: Bool[np.ndarray, " cluster"]
+    fitted: fitting.Fit
+    charged: Float[np.ndarray, " cluster"]
 
 
 def cross_fit(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> HeldOut:
@@ -67,30 +89,61 @@ def cross_fit(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> 
 
 def fold_fits(problem: Problem, fitted: fitting.Fit, assignment: np.ndarray) -> Iterator[Fold]:
     """Refit without each fold in turn."""
+    gains = _gained(problem, fitted)
     for fold in np.unique(assignment):
         held = assignment == fold
         kept = (~held).astype(float)
-        yield (
-            held,
-            fitting.fit(problem, fitted.x, fitted.effects, weights=kept, spread=fitted.spread, steps=15),
-        )
+        part = fitting.fit(problem, fitted.x, fitted.effects, weights=kept, spread=fitted.spread, steps=15)
+        yield _completed(problem, fitted, Fold(held, part, np.zeros(len(held))), gains)
+
+
+def _gained(problem: Problem, fitted: fitting.Fit) -> dict[str, np.ndarray]:
+    """Nats that each mean effect of a fit gains in each cluster (cluster,), all else as it is."""
+    here = problem.compiled.evaluate(fitted.x)[0]
+    gains: dict[str, np.ndarray] = {}
+    for effect in (e for e in problem.effects if e.name in fitted.effects and e.kind == "mean"):
+        others = [name for name in fitted.effects if name != effect.name]
+        without = problem.compiled.evaluate(at_null_except(problem, fitted, others))[0]
+        gains[effect.name] = np.nan_to_num(np.asarray(here - without))
+    return gains
+
+
+def _completed(problem: Problem, fitted: fitting.Fit, fold: Fold, gains: Mapping[str, np.ndarray]) -> Fold:
+    """The fold with the parameters of effects of which the clusters that it keeps tell nothing."""
+    x, covariance, charged = fold.fitted.x.copy(), fold.fitted.covariance.copy(), fold.charged.copy()
+    for effect in (e for e in problem.effects if e.name in gains):
+        gain = gains[effect.name]
+        telling = fold.held & (gain > _TOLD)
+        if not telling.any() or np.abs(gain[~fold.held]).sum() > _TOLD:
+            continue
+        index = problem.layout.of(effect)
+        x[index] = fitted.x[index]
+        place = np.searchsorted(fitted.global_index, index)
+        covariance[place], covariance[:, place] = 0.0, 0.0
+        covariance[np.ix_(place, place)] = fitted.covariance[np.ix_(place, place)]
+        choice = np.log(sum(e.family == effect.family for e in problem.effects))
+        charged[telling] += (effect.dimension + choice) / telling.sum()
+    return Fold(fold.held, replace(fold.fitted, x=x, covariance=covariance), charged)
 
 
 def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
     """How fits do on the clusters that each of them has not seen."""
     log_likelihood, missed = np.zeros(problem.n_cluster), dict[str, Miss]()
     estimates: dict[str, list[np.ndarray]] = {}
-    doubt = 0.0
-    for held, part in folds:
+    doubt, alone = 0.0, np.zeros(problem.n_cluster, bool)
+    for held, part, charged in folds:
         earlier = on_earlier_data(problem, part)
-        log_likelihood[held] = marginal(problem, part)[held] + earlier.value / problem.n_cluster
+        seen = marginal(problem, part) - charged
+        log_likelihood[held] = seen[held] + earlier.value / problem.n_cluster
+        alone |= charged > 0
         doubt += earlier.variance * held.mean()
         for name, miss in problem.compiled.misses(part.x).items():
             before = missed.get(name, Miss(0.0, 0.0, 0.0))
             missed[name] = Miss(*(b + np.where(held, m, 0.0) for b, m in zip(before, miss, strict=True)))
         for block in (b for name in part.effects for b in problem.blocks_of(name) if not b.local):
             estimates.setdefault(block.name, []).append(part.x[block.index[0]])
-    return HeldOut(log_likelihood, missed, {n: np.stack(v) for n, v in estimates.items()}, doubt)
+    stacked = {n: np.stack(v) for n, v in estimates.items()}
+    return HeldOut(log_likelihood, missed, stacked, doubt, np.flatnonzero(alone))
 
 
 @dataclass(frozen=True)
@@ -185,8 +238,21 @@ def _fraction(gain: ArrayLike, rest: ArrayLike) -> np.ndarray:
 
 
 def _gains(before: HeldOut, after: HeldOut, key: jax.Array, draws: int) -> tuple[np.ndarray, np.ndarray]:
-    """Gain of each cluster, and its totals over bootstrap draws of the clusters and of what earlier data say by chance."""
+    """Gain of each cluster, and its totals over bootstrap draws of the clusters and of what earlier data say by chance.
+
+    The gain g of clusters that tell alone of an effect is a log likelihood ratio, of variance 2 g.
+    """
     gain = after.log_likelihood - before.log_likelihood
-    index = np.asarray(jax.random.randint(key, (draws, len(gain)), 0, len(gain)))
+    own = gain[after.alone].sum()
     chance = np.asarray(jax.random.normal(jax.random.fold_in(key, 2), (draws,)))
-    return gain, gain[index].sum(1) + np.sqrt(max(before.doubt - after.doubt, 0.0)) * chance
+    variance = max(before.doubt - after.doubt, 0.0) + 2 * max(own, 0.0)
+    return gain, gain[resampled(len(gain), after.alone, key, draws)].sum(1) + np.sqrt(variance) * chance
+
+
+def resampled(
+    n_cluster: int, alone: Int[np.ndarray, " few"], key: jax.Array, draws: int
+) -> Int[np.ndarray, "draw cluster"]:
+    """Bootstrap draws of clusters, in each of which those are that tell alone of an effect."""
+    others = np.setdiff1d(np.arange(n_cluster), alone)
+    index = np.asarray(jax.random.randint(key, (draws, len(others)), 0, max(len(others), 1)))
+    return np.concatenate([others[index], np.broadcast_to(alone, (draws, len(alone)))], axis=1)

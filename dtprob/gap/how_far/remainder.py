@@ -7,6 +7,7 @@ cluster's own, or a spread, widens the prediction there. Both are judged on clus
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
@@ -92,10 +93,10 @@ def model_remainder(
         return None
     wider, fitted = _wider(view, named)
     full = _forward(wider, fitted, tuple(named))
-    taken = [n for n in named if n in full.effects]
+    taken = sorted((n for n in named if n in full.effects), key=lambda n: -named[n].evidence)
     if not taken:
         return None
-    parts = list(closed.fold_fits(wider, full, np.sum([i * h for i, (h, _) in enumerate(folds)], axis=0)))
+    parts = list(closed.fold_fits(wider, full, np.sum([i * f.held for i, f in enumerate(folds)], axis=0)))
     after = closed.judged(wider, parts)
     reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
     size = sum(_determined(wider, full, n) for n in taken)
@@ -125,12 +126,22 @@ def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) ->
     promising = [s for s in view.location.suspects if s.evidence - s.price > enough]
     shared = [s for s in promising if not is_per_cluster(problem, s)]
     apart = {(s.site, round(s.evidence, 3)): s for s in shared if size_of(problem, s) <= _WEIGHTS}
-    named = _named(list(apart.values())[:_TRIED])
+    named = _named(_site_by_site(list(apart.values()))[:_TRIED])
     if not named:
         return -np.inf
     begun()
     wider, fitted = _wider(view, named)
     return max(_fitted_with(wider, fitted, name).log_evidence - s.price for name, s in named.items())
+
+
+def _site_by_site(suspects: Sequence[Suspect]) -> list[Suspect]:
+    """The best family of each site first, then the second best: rows far out look like noise, whatever moves them."""
+    met: Counter[str] = Counter()
+    turns: list[int] = []
+    for suspect in suspects:
+        turns.append(met[suspect.site])
+        met[suspect.site] += 1
+    return [suspects[i] for i in sorted(range(len(suspects)), key=turns.__getitem__)]
 
 
 def _named(suspects: Sequence[Suspect]) -> dict[str, Suspect]:
@@ -150,7 +161,7 @@ def _wider(view: View, named: Mapping[str, Suspect]) -> tuple[Problem, fitting.F
 
 
 def shortlist(problem: Problem, suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """The families to try: most evidence first, each thing once."""
+    """The families to try: most evidence first, site by site, each thing once."""
     chosen: list[Suspect] = []
     for suspect in sorted(suspects, key=lambda s: (-round(s.evidence, 3), s.rows is not None)):
         size = 0 if is_per_cluster(problem, suspect) else size_of(problem, suspect)
@@ -159,14 +170,15 @@ def shortlist(problem: Problem, suspects: Sequence[Suspect]) -> tuple[Suspect, .
         same = any(s.site == suspect.site or suspect.evidence > _SAME * s.evidence for s in known)
         if suspect.evidence >= _LEAST and not same and size <= _WEIGHTS:
             chosen.append(suspect)
-    return tuple(chosen[:_TRIED])
+    return tuple(_site_by_site(chosen)[:_TRIED])
 
 
 def _forward(problem: Problem, fitted: fitting.Fit, names: Sequence[str]) -> fitting.Fit:
-    """The fit with those of the fields that raise the evidence, each beside the ones before it."""
+    """The fit with those of the fields that raise the evidence, each beside the ones before it, the best alone first."""
+    alone = {name: _fitted_with(problem, fitted, name) for name in names}
     taken = 0
-    for name in names:
-        trial = _fitted_with(problem, fitted, name)
+    for name in sorted(names, key=lambda name: -alone[name].log_evidence):
+        trial = _fitted_with(problem, fitted, name) if taken else alone[name]
         if trial.log_evidence > fitted.log_evidence + _LEAST:
             fitted, taken = trial, taken + 1
         if taken == _TAKEN:

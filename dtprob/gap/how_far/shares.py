@@ -18,7 +18,7 @@ from jaxtyping import Float
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.refit import at_null_except
-from dtprob.gap.how_far.closed import HeldOut, cross_fit
+from dtprob.gap.how_far.closed import HeldOut, cross_fit, resampled
 from dtprob.gap.model.problem import Problem
 
 _DRAWS = 2000
@@ -92,7 +92,7 @@ def shares(
     if gained.sum() <= 0:
         return ()
     values = shapley(effects, value)
-    index = np.asarray(jax.random.randint(key, (_DRAWS, len(gained)), 0, len(gained)))
+    index = resampled(len(gained), held[1].alone, key, _DRAWS)
     total = gained[index].sum(1)
     found = []
     for effect in effects:

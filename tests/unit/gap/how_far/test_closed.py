@@ -8,6 +8,8 @@ import numpyro.distributions as dist
 import pytest
 from scipy import stats
 
+from dtprob.effects.common import normal
+from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.how_far import closed
@@ -49,6 +51,64 @@ def test_cross_fit_judges_each_cluster_by_the_others():
     missed = found.misses["y"].error.sum()
     np.testing.assert_allclose(error_db(problem, found), 10 * np.log10(missed / (y**2).sum()), rtol=1e-9)
     np.testing.assert_allclose(in_user_terms(problem, found, None)["y_rmse"][0], np.sqrt(missed / y.size))
+
+
+@pytest.mark.parametrize(("fault", "is_told"), [(0.0, False), (1.0, True)])
+def test_the_fault_of_one_device_is_told_by_that_device_alone(fault, is_told):
+    """The others tell nothing of it: held out it never closed a gap, whatever its size."""
+    data, rng = draw("line"), np.random.default_rng(3)
+    y = np.asarray(data["x"]) + SIGMA * rng.normal(size=data["x"].shape)
+    y[4] += fault
+    at = np.arange(12)[:, None] == 4
+    faulty = Effect("faulty", {"mean": lambda value, p, _: value + p["shift"] * at}, (normal("shift", 1.0),))
+    problem = Problem(line, {**data, "y": jnp.asarray(y)}, [faulty]).with_live(["faulty"])
+    base, full = (fitting.fit(problem, np.zeros(3), names) for names in ((), ("faulty",)))
+    assignment = closed.folds(12, 3)
+    before, after = (closed.cross_fit(problem, fitted, assignment) for fitted in (base, full))
+    gain = after.log_likelihood - before.log_likelihood
+    if not is_told:
+        assert closed.closed_fraction(before, after, Floor(gain.sum(), gain.sum()), jax.random.key(0)) is None
+        return
+    assert list(after.alone) == [4]
+    beside = (assignment == assignment[4]) & (np.arange(12) != 4)
+    np.testing.assert_allclose(gain[beside], 0.0, atol=0.05)
+    # charged a nat for its parameter
+    seen = np.asarray(problem.compiled.evaluate(full.x)[0])[4]
+    assert after.log_likelihood[4] == pytest.approx(seen - 1.0, abs=0.3)
+    (own,) = (fold for fold in closed.fold_fits(problem, full, assignment) if fold.charged.any())
+    known = full.covariance[2, 2]
+    assert own.fitted.covariance[2] == pytest.approx([0.0, 0.0, known])
+    floor = Floor(float(after.log_likelihood.sum()), float(after.log_likelihood.sum()))
+    found = closed.closed_fraction(before, after, floor, jax.random.key(0))
+    assert found is not None
+    assert found.mean == pytest.approx(1.0)
+
+
+def test_what_other_clusters_refute_is_not_told_by_one():
+    """A curve in the one cluster that reaches far: the others, which lose by it, do tell of it."""
+    rng = np.random.default_rng(3)
+    x = rng.uniform(-1, 1, (12, 20))
+    x[4] *= 3
+    y = x + SIGMA * rng.normal(size=x.shape)
+    y[4] += 1.5 * x[4] ** 2
+    curve = Effect(
+        "curve", {"mean": lambda value, p, c: value + p["size"] * c["x"] ** 2}, (normal("size", 1.0),)
+    )
+    data = {"x": jnp.asarray(x), "y": jnp.asarray(y)}
+    problem = Problem(line, data, [curve]).with_live(["curve"])
+    base, full = (fitting.fit(problem, np.zeros(3), names) for names in ((), ("curve",)))
+    before, after = (closed.cross_fit(problem, fitted, closed.folds(12, 4)) for fitted in (base, full))
+    assert full.x[2] > 1.0
+    assert not after.alone.size
+    reached = float(after.log_likelihood.sum())
+    assert closed.closed_fraction(before, after, Floor(reached, reached), jax.random.key(0)) is None
+
+
+def test_draws_keep_the_clusters_that_tell_alone():
+    drawn = closed.resampled(6, np.array([4]), jax.random.key(0), 500)
+    assert drawn.shape == (500, 6)
+    assert np.all((drawn == 4).sum(axis=1) == 1)
+    assert {*np.unique(drawn)} == {*range(6)}
 
 
 def test_fraction_of_a_known_gap():

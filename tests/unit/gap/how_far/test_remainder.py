@@ -254,6 +254,17 @@ def test_one_thing_under_two_names_is_tried_once():
     assert [s.site for s in shortlist(problem, pair)] == ["deviation", "mean"]
 
 
+def test_families_are_tried_site_by_site():
+    """Rows far out look like noise that varies in many ways, whatever moves them: these are not all that is tried."""
+    problem = prepared(rows(5))[0]
+    known = [c.label for c in curves(problem, "row", N_ROW) if c.extent[0] <= 16]
+    labels = [label for label in known if label != "along place"][:5]
+    loud = [suspect(problem, label, site="deviation", kind="relative", evidence=90.0) for label in labels]
+    moved = suspect(problem, "along place", site="mean", kind="additive", evidence=30.0)
+    found = shortlist(problem, [*loud, moved])
+    assert [s.site for s in found[:3]] == ["deviation", "mean", "deviation"]
+
+
 def test_a_family_that_stands_alone_pays_for_having_been_picked():
     problem, fitted, _, _ = prepared(rows(1, wave))
     place, street = (

@@ -41,7 +41,7 @@ def levels(y=None, kind="normal"):
 def held_out(kind, y):
     problem = Problem(levels, {"y": jnp.asarray(y), "kind": kind}, [])
     fitted = fitting.fit(problem, np.zeros(1), tolerance=1e-10)
-    everything = [(np.ones(RUNS, bool), fitted)]
+    everything = [closed.Fold(np.ones(RUNS, bool), fitted, np.zeros(RUNS))]
     return problem, closed.judged(problem, everything), float(fitted.x[0])
 
 
