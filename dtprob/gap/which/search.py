@@ -29,6 +29,11 @@ _REVISIONS: Final = 4
 _NEARLY: Final = 3.0
 """Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect; by which
 one family of a site has to be better than effects that stand in for it."""
+_FAR: Final = 8.0
+_FAR_SHARE: Final = 0.15
+"""Nats, and share of what was gained, by which it has to be better than a single effect, real ones having other forms."""
+_MISSED: Final = 6.0
+"""Times what first-order scores promise that a refit may gain."""
 _UNDERSTATED: Final = 0.15
 """Share of a gain that first-order scores may miss."""
 
@@ -67,8 +72,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
 
     Where a random field was accepted, which can imitate several effects at once, the search goes on without it too, but not
     without one whose place was found, which can imitate little. Where a pair promises as much as was reached, the search
-    starts from that pair. A field, or several effects, that one
-    family of a site beats is taken back: it stands in for what is not known.
+    starts from that pair. What one family of a site beats, a single effect by far, is taken back: it stands in for what is
+    not known.
 
     Args:
         problem: the model and candidates on their data.
@@ -86,7 +91,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         say(f"looking for effects that {field} may have imitated")
         rest = _refitted_without(end.problem, end.fitted, field)
         key = jax.random.fold_in(key, 1)
-        others = _forward(rest.problem, rest.fitted, key, settings, say, base=base, banned=field)
+        goal = credit(problem, end.fitted, base)
+        others = _forward(rest.problem, rest.fitted, key, settings, say, base=base, banned=field, goal=goal)
         ways.append([*steps[:-1], *others])
     reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
     pair = _promising(ways, reached - base.log_evidence, settings)
@@ -97,15 +103,23 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         others = _forward(both.problem, both.fitted, key, settings, say, base=base, banned=field)
         ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
-    first, bare = ways[0][-1].view.fitted, steps[0].view
-    if len(first.effects) > 1 or first.effects == (field,):
-        least = credit(problem, first, base) + _NEARLY
-        stands_in = "stands" if len(first.effects) == 1 else "stand"
-        doing = f"looking whether {' and '.join(first.effects)} {stands_in} in for what varies more simply at a site"
-        if alone(bare, least, lambda: say(doing)) > least:
-            ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
+    bare = steps[0].view
+    if _stands_in(bare, ways[0][-1].view.fitted, base, field, say):
+        ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
+
+
+def _stands_in(bare: View, found: fitting.Fit, base: fitting.Fit, field: str | None, say: Say) -> bool:
+    """Whether one family of a site is better than what was found, by how much depends on what that can imitate."""
+    if not found.effects:
+        return False
+    worth = credit(bare.problem, found, base)
+    may_imitate = len(found.effects) > 1 or found.effects == (field,)
+    least = worth + (_NEARLY if may_imitate else max(_FAR, _FAR_SHARE * (worth - base.log_evidence)))
+    verb = "stands" if len(found.effects) == 1 else "stand"
+    doing = f"looking whether {' and '.join(found.effects)} {verb} in for what varies more simply at a site"
+    return alone(bare, least, lambda: say(doing)) > least
 
 
 def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
@@ -154,8 +168,11 @@ def _forward(
     *,
     base: fitting.Fit | None = None,
     banned: str | None = None,
+    goal: float = -np.inf,
 ) -> list[Step]:
     """Steps from a fit, which may have effects already, each followed by a look at earlier choices.
+
+    Where there is a goal, a credit that is reached already on another way, steps that are too short for it are not taken.
 
     Such looks may lead in a circle, since what is given up is judged otherwise than what is taken: the one with most credit
     is its end.
@@ -170,7 +187,12 @@ def _forward(
             return [*steps, Step(most, Trials(most.problem, {}), None)]
         seen = _looked(problem, fitted, jax.random.fold_in(key, len(steps)), settings, say)
         little = seen.promise < settings.minor * (fitted.log_evidence - base.log_evidence)
-        if little or len(fitted.effects) == settings.max_effects or not seen.alarmed(settings):
+        if (
+            little
+            or _is_hopeless(seen, base, goal, settings, banned)
+            or len(fitted.effects) == settings.max_effects
+            or not seen.alarmed(settings)
+        ):
             return [*steps, Step(seen, Trials(problem, {}), None)]
         visited[frozenset(fitted.effects)] = seen
         trials = tried(seen, settings, say, banned=banned)
@@ -189,6 +211,20 @@ def _forward(
         steps += _revised(steps[-1], base, keys, settings, say, banned=banned)
         reached = steps[-1].end
         problem, fitted = reached.problem, reached.fitted
+
+
+def _is_hopeless(seen: View, base: fitting.Fit, goal: float, settings: Settings, banned: str | None) -> bool:
+    """Whether further steps do not reach a credit, each of them some times what the best candidate promises.
+
+    Not beside no effect yet, where scans may find what first-order scores miss.
+    """
+    if not np.isfinite(goal) or not seen.fitted.effects:
+        return False
+    screening = seen.screening
+    promises = zip(screening.names, screening.log_bayes_factor, strict=True)
+    most = max((float(promise) for name, promise in promises if name != banned), default=0.0)
+    left = settings.max_effects - len(seen.fitted.effects)
+    return credit(seen.problem, seen.fitted, base) + _MISSED * left * max(most, 0.0) < goal
 
 
 def _looked(

@@ -77,3 +77,27 @@ def test_a_search_that_goes_in_a_circle_ends_where_most_credit_is(monkeypatch):
     steps = search._forward(problem, fitted(), jax.random.key(0), Settings(), lambda _: None)
     assert [step.view.fitted.effects for step in steps] == [(), ("a",), ("b",), ("b",)]
     assert steps[-1].accepted is None
+
+
+@pytest.mark.parametrize(("promise", "goal", "is_hopeless"), [(50.0, 600.0, False), (20.0, 600.0, True)])
+def test_a_way_that_cannot_reach_what_another_one_has_is_left(promise, goal, is_hopeless):
+    """100 nats and three steps of up to six times the promise; the banned field promises all."""
+    problem = SimpleNamespace(
+        effects=[
+            SimpleNamespace(name=n, kind="variance" if n == "field" else "mean") for n in ("a", "b", "field")
+        ]
+    )
+    fits = {
+        names: SimpleNamespace(effects=names, log_evidence=evidence)
+        for names, evidence in (((), 0.0), (("a",), 100.0))
+    }
+    screening = SimpleNamespace(names=("b", "field"), log_bayes_factor=np.array([promise, 900.0]))
+    settings = Settings(max_effects=4)
+
+    def hopeless(effects, goal):
+        seen = SimpleNamespace(problem=problem, fitted=fits[effects], screening=screening)
+        return search._is_hopeless(seen, fits[()], goal, settings, "field")
+
+    assert hopeless(("a",), goal) == is_hopeless
+    assert not hopeless((), 1e6)
+    assert not hopeless(("a",), -np.inf)
