@@ -100,7 +100,9 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         say(f"starting from {pair[0]} and {pair[1]} together")
         both = _refitted_with(steps[0].view, pair, settings)
         key = jax.random.fold_in(key, 2)
-        others = _forward(both.problem, both.fitted, key, settings, say, base=base, banned=field)
+        others = _forward(
+            both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=reached
+        )
         ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
     bare = steps[0].view
