@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
+from dtprob.effects.covering import covering
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.label_regions import Region, Weight, groupings, regions, slopes
 
@@ -151,7 +152,8 @@ def _districts(
     if not len(kept):
         return None
     unit = spread[kept] * _REACH
-    points = _spread_out(x[:, kept] / unit)
+    places = x[:, kept] / unit
+    points = places[covering(places, _POINTS)]
     between = np.linalg.norm(points[:, None] - points[None], axis=-1)
     root = np.linalg.cholesky(np.exp(-between) + _JITTER * np.eye(len(points)))
 
@@ -161,15 +163,6 @@ def _districts(
         return jax.scipy.linalg.solve_triangular(root, jnp.exp(-jnp.sqrt(square)).T, lower=True).T
 
     return weights
-
-
-def _spread_out(place: Float[np.ndarray, "sample feature"]) -> Float[np.ndarray, "point feature"]:
-    """Points that cover the samples evenly: each next one is the sample farthest from those before."""
-    chosen, distance = [0], np.linalg.norm(place - place[0], axis=1)
-    while len(chosen) < min(_POINTS, len(place)):
-        chosen.append(int(np.argmax(distance)))
-        distance = np.minimum(distance, np.linalg.norm(place - place[chosen[-1]], axis=1))
-    return place[chosen]
 
 
 def _unit(data: Data) -> float:

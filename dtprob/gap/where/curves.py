@@ -10,6 +10,7 @@ from typing import Final, NamedTuple, cast
 import numpy as np
 from scipy import sparse, stats
 
+from dtprob.effects.covering import covering
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.data_columns import columns
 
@@ -142,12 +143,8 @@ def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
 def _neighbourhoods(place: np.ndarray) -> sparse.csr_matrix:
     """The positions nearest to each of a few places (size, 2) that cover them evenly, in small, larger and large groups."""
     unit = (place - place.mean(axis=0)) / place.std(axis=0)
-    size, centres = len(unit), [0]
-    distance = [np.linalg.norm(unit - unit[0], axis=1)]
-    while len(centres) < min(_CENTRES, size):
-        centres.append(int(np.argmax(np.min(distance, axis=0))))
-        distance.append(np.linalg.norm(unit - unit[centres[-1]], axis=1))
-    nearest = np.argsort(np.stack(distance), axis=1)
+    size, centres = len(unit), unit[covering(unit, _CENTRES)]
+    nearest = np.argsort(np.linalg.norm(unit - centres[:, None], axis=-1), axis=1)
     members = sorted({max(int(size * share), 2) for share in _NEAREST})
     groups = [row[:count] for count in members for row in nearest]
     weight = np.repeat(np.arange(len(groups)), [len(group) for group in groups])

@@ -79,7 +79,7 @@ def family_test(family: Family, scores: np.ndarray, normal: np.ndarray | None = 
         np.append(statistic, n * counted.sum()), float(statistic.mean()), float(statistic.var()), n - 1
     )
     if steady.sum() >= max(_SEVERAL, _MOSTLY * alive.sum()):
-        weighed = np.minimum(scores[0, steady] ** 2 / total[steady], 1 / _ALONE - 1) * weight[steady]
+        weighed = np.minimum(own[steady[alive]], 1 / _ALONE - 1) * weight[steady]
         p = np.minimum(p, largest_tail(np.append((n - 1) * largest, n * weighed.max())))
     return FamilyTest(family, float(p[-1]), p[:-1], first, total / n)
 

@@ -174,10 +174,8 @@ def _forward(
 ) -> list[Step]:
     """Steps from a fit, which may have effects already, each followed by a look at earlier choices.
 
-    Where there is a goal, a credit that is reached already on another way, steps that are too short for it are not taken.
-
     Such looks may lead in a circle, since what is given up is judged otherwise than what is taken: the one with most credit
-    is its end.
+    is its end. Where there is a goal, a credit that another way has reached already, steps too short for it are not taken.
     """
     steps: list[Step] = []
     fitted, returns = start, 0
