@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from dtprob.gap.fitting.active import LOG_2PI, Active, basis, effect_prior
@@ -42,6 +44,34 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
         cross,
         local,
         np.asarray(active.weights),
+        effect_curvature,
+    )
+
+
+def rescored(problem: Problem, active: Active, x: np.ndarray, system: System) -> System:
+    """A system whose scores are those at x, its curvatures as they were but for those of effects' priors.
+
+    A gradient costs a few evaluations, however many coordinates are free; a system two for each of them.
+    """
+    g_index, l_index = active.global_index, active.local_index
+    prior_gradient, _ = problem.compiled.prior(x, np.zeros((0, problem.dimension)))
+    _, effect_gradient, bend = effect_prior(problem, active, x)
+    prior_gradient = prior_gradient + effect_gradient
+    if problem.volume is not None and len(g_index):
+        prior_gradient[problem.volume.index] += np.asarray(active.weights) @ problem.volume.gradient(x)
+    slope = problem.compiled.slope(x, active.weights)
+    own = slope
+    if l_index.size and (active.weights != 1).any():
+        own = problem.compiled.slope(x, np.ones_like(active.weights))
+    change = bend - system.bend
+    local = system.local + np.eye(l_index.shape[1]) * change[l_index][:, None]
+    return replace(
+        system,
+        gradient=(slope + prior_gradient)[g_index],
+        local_gradient=(own + prior_gradient)[l_index],
+        curvature=system.curvature + np.diag(change[g_index]),
+        local=local,
+        bend=bend,
     )
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.active import LOG_2PI, Active, activate
-from dtprob.gap.fitting.density import moved, system_at, value_of, volume_of
+from dtprob.gap.fitting.density import moved, rescored, system_at, value_of, volume_of
 from dtprob.gap.fitting.newton import NewtonStep, System, newton_step, positive
 from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
@@ -29,6 +29,12 @@ _SETTLED: Final = 0.01
 _LEAST_DAMPING: Final = 1e-12
 _FARTHEST: Final = 10.0
 """Standard deviations of its prior that an unknown of the base model moves in a step at most."""
+_AS_PROMISED: Final = (0.6, 1.4)
+"""Share of a promised gain that shows that curvatures still hold, so that a gradient is all that the next step needs."""
+_ALIKE: Final = 0.5
+"""Change of the logarithm of a field's standard deviation up to which they may."""
+_CHEAP: Final = 0.25
+"""What a step with kept curvatures counts for among the steps of a fit."""
 _STUCK: Final = 1e3
 """Damping beyond which a fit has arrived, whatever its quadratic promises."""
 
@@ -72,7 +78,7 @@ def fit(
     effects: Sequence[str] = (),
     *,
     weights: np.ndarray | None = None,
-    steps: int = 40,
+    steps: float = 40,
     tolerance: float = 1e-3,
     spread: Mapping[str, float] = MappingProxyType({}),
 ) -> Fit:
@@ -83,7 +89,7 @@ def fit(
         x: flat vector to start from; coordinates of effects that are not free stay as they are.
         effects: names of the effects that are free.
         weights: per cluster, 0 leaves it out of the fit.
-        steps: at most so many Gauss-Newton steps.
+        steps: at most so many Gauss-Newton steps, those that keep the last curvatures counting for a quarter.
         tolerance: stop when the predicted gain in nats falls below.
         spread: first standard deviation of variance effects' fields by name; see `activate`.
     """
@@ -93,12 +99,16 @@ def fit(
     if value == -np.inf and not np.isfinite(problem.compiled.residual(x)).all():
         return _hopeless(active, x)
     latest: Changes = {}
-    for _ in range(steps):
-        system = system_at(problem, active, x)
+    last: System | None = None
+    while steps > 0:
+        fresh = last is None
+        steps -= 1 if fresh else _CHEAP
+        system = system_at(problem, active, x) if last is None else rescored(problem, active, x, last)
         if not system.finite:
             return _hopeless(active, x)
         trial = _better(problem, active, system, x, value=value, damping=damping, tolerance=tolerance)
-        better = trial.value > value
+        gained = trial.value - value
+        better = gained > 0
         converged = trial.gain < tolerance or (not better and trial.damping > _STUCK)
         if better:
             x, value, damping = trial.x, trial.value, max(trial.damping / 8, _LEAST_DAMPING)
@@ -107,8 +117,11 @@ def fit(
             active, change, latest = respread(problem, active, x, system, latest)
             value = value_of(problem, active, x)
         converged = converged and change < _SETTLED
-        if converged or not (better or change >= _SETTLED):
+        ends = converged or not (better or change >= _SETTLED)
+        if ends and fresh:  # kept curvatures may promise too little where they have fallen since
             break
+        as_promised = _AS_PROMISED[0] * trial.gain < gained < _AS_PROMISED[1] * trial.gain
+        last = system if as_promised and not ends and change < _ALIKE else None
     return _finish(problem, active, x, value, converged)
 
 

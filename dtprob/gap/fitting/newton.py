@@ -29,6 +29,7 @@ class System:
         cross: (cluster, global, local).
         local: (cluster, local, local).
         weights: of the clusters.
+        bend: of the flat vector (dimension,), what effects' priors add to the curvatures' diagonals.
     """
 
     gradient: Float[np.ndarray, " global"]
@@ -37,6 +38,7 @@ class System:
     cross: Float[np.ndarray, "cluster global local"]
     local: Float[np.ndarray, "cluster local local"]
     weights: Float[np.ndarray, " cluster"]
+    bend: Float[np.ndarray, " dimension"]
 
     @property
     def finite(self) -> bool:

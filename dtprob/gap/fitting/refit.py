@@ -22,6 +22,8 @@ _BETTER = 0.5
 """Nats by which another optimum has to be higher."""
 _SWEPT = 3
 """Parameters of an effect whose large sizes are tried with the clusters' angles found anew."""
+_SAME = 1.0
+"""Nats by which a peak has to be higher than a start that the same hill leads from."""
 _REACH = 0.4
 """Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
@@ -135,7 +137,10 @@ def _along(
     lines: Sequence[tuple[int, float, bool]],
     settings: Settings,
 ) -> tuple[float, list[tuple[float, np.ndarray]]]:
-    """The log posterior at a point, and the local maxima on lines through x: position, scale, and whether one-sided."""
+    """The log posterior at a point, and the local maxima on lines through x: position, scale, and whether one-sided.
+
+    Those that a climb from the point leads to are left out, unless they are higher than the point.
+    """
     half = np.linspace(-2.5, 2.5, 2 * settings.grid + 1)
     fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
     steps = np.unique(np.concatenate([half, fine, -fine]))
@@ -146,12 +151,28 @@ def _along(
         line[:, position] += offsets
         trials.append(line)
     values = np.asarray(problem.compiled.profile(np.concatenate([point[None], *trials])))
-    peaks, low = [], 1
-    for line in trials:
-        v = values[low : low + len(line)]
+    reached, low, peaks = float(values[0]), 1, []
+    for (position, _, _), line in zip(lines, trials, strict=True):
+        v, on_line = values[low : low + len(line)], line[:, position]
         low += len(line)
-        peaks += [(float(v[k]), line[k]) for k in local_maxima(v)]
-    return float(values[0]), peaks
+        hill = _hill(v, on_line, float(point[position]))
+        least = (
+            reached + _SAME if len(lines) == 1 else reached
+        )  # of several lines none may lead through the point
+        peaks += [(float(v[k]), line[k]) for k in local_maxima(v) if k != hill or v[k] > least]
+    return reached, peaks
+
+
+def _hill(values: np.ndarray, places: np.ndarray, place: float) -> int:
+    """The local maximum (its index) that a climb along a line from a place on it ends at."""
+    at = int(np.argmin(np.abs(places - place)))
+    finite = np.where(np.isfinite(values), values, -np.inf)
+    while True:
+        around = [k for k in (at - 1, at + 1) if 0 <= k < len(finite)]
+        higher = max(around, key=lambda k: finite[k])
+        if finite[higher] <= finite[at]:
+            return at
+        at = higher
 
 
 def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[np.ndarray]:

@@ -97,6 +97,20 @@ class Compiled:
         return self.linearised(x, np.zeros((0, self._runner.layout.dimension)))[0]
 
     @cached_property
+    def slope(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        """(x, weights (cluster,)) -> gradient (dimension,) of the clusters' weighted log likelihoods."""
+
+        @quick_jit
+        def slope(x: Any, weights: Any, arrays: Arrays) -> jax.Array:
+            def total(y: Any) -> jax.Array:
+                likelihood = self.terms(y, arrays).likelihood
+                return jnp.sum(weights * jnp.where(weights > 0, likelihood, 0.0))
+
+            return jax.grad(total)(x)
+
+        return lambda x, weights: np.asarray(slope(jnp.asarray(x), jnp.asarray(weights), self.arrays))
+
+    @cached_property
     def linearised(self) -> Callable[[np.ndarray, np.ndarray], tuple[jax.Array, jax.Array]]:
         """(x, basis (k, dimension)) -> whitened residuals (cluster, row) and tangents (cluster, row, k)."""
 

@@ -12,6 +12,7 @@ from scipy.special import logsumexp
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.density import system_at
 from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.newton import positive
 from dtprob.gap.fitting.plausible import SCALES
@@ -306,3 +307,40 @@ def test_the_farthest_step_knows_the_base_model_alone():
     fitting.fit(start, start.null(), ("wide",))
     other = start.with_live([bend().name])
     assert fitting.fit(other, other.null(), (bend().name,)).converged
+
+
+def amplified(u, y=None, z=None):
+    """An amplitude behind a loss, which is measured apart."""
+    loss = numpyro.sample("loss", dist.Normal(0.0, 3.0))
+    amplitude = numpyro.sample("amplitude", dist.Normal(0.0, 50.0))
+    with numpyro.plate("link", u.shape[0]):
+        numpyro.sample("z", dist.Normal(numpyro.deterministic("known", loss + 0.0 * u), 0.1), obs=z)
+        received = numpyro.deterministic("received", amplitude * jnp.exp(-loss) * u)
+        numpyro.sample("y", dist.Normal(received, 0.05), obs=y)
+
+
+@pytest.mark.parametrize(("loss", "amplitude"), [(4.0, 0.5), (6.0, 27.0)])
+def test_kept_curvatures_do_not_end_a_fit_where_others_have_fallen(loss, amplitude):
+    """The loss arrives in one step as promised, while the amplitude's curvature falls by a factor of thousands."""
+    rng = np.random.default_rng(1)
+    u = rng.normal(size=100)
+    y = amplitude * np.exp(-loss) * u + 0.05 * rng.normal(size=100)
+    z = loss + 0.1 * rng.normal(size=100)
+    data = {"u": jnp.asarray(u), "y": jnp.asarray(y), "z": jnp.asarray(z)}
+    fitted = fitting.fit(Problem(amplified, data, []), np.zeros(2))
+    expected = [np.mean(z), np.exp(np.mean(z)) * (u @ y) / (u @ u)]
+    assert fitted.converged
+    np.testing.assert_allclose(fitted.x, expected, rtol=0.02)
+
+
+def test_a_fit_with_kept_curvatures_makes_fewer_systems_and_ends_where_it_would(monkeypatch):
+    problem, made = Problem(spread, draw("spread"), []), []
+    monkeypatch.setattr(fitting, "system_at", lambda *a: made.append(1) or system_at(*a))
+    start = problem.null() + 1.0
+    kept = fitting.fit(problem, start, tolerance=1e-8)
+    count = len(made)
+    monkeypatch.setattr(fitting, "_AS_PROMISED", (2.0, 1.0))
+    anew = fitting.fit(problem, start, tolerance=1e-8)
+    assert count < len(made) - count
+    np.testing.assert_allclose(kept.x, anew.x, rtol=1e-5)
+    np.testing.assert_allclose(kept.log_evidence, anew.log_evidence, rtol=1e-8)

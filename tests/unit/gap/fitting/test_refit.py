@@ -2,14 +2,16 @@
 
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from dtprob.effects import catalogue
 from dtprob.gap.fitting import fit as fitting
-from dtprob.gap.fitting.refit import refit, starting_points
+from dtprob.gap.fitting.refit import _hill, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.models.declaration import declare
 from dtprob.models.label_twin import label_twin
+from tests.unit.gap.examples import bend, draw, line
 
 
 def test_a_field_whose_unit_is_small_is_found():
@@ -43,3 +45,21 @@ def test_edges_are_looked_for_beside_the_best_size():
     assert min(abs(start[edge].item() - 0.56) for start in starts) < 0.06
     found = refit(problem, base, effects[0], starts)
     np.testing.assert_allclose(found.x[edge], np.mean(x[:, 0] <= 0.56), atol=0.01)
+
+
+@pytest.mark.parametrize(("place", "top"), [(-2.0, 1), (-0.4, 1), (0.6, 7), (2.0, 7)])
+def test_a_climb_ends_on_the_hill_that_it_starts_on(place, top):
+    places = np.linspace(-2.0, 2.0, 9)
+    values = np.array([0.0, 3.0, 2.0, 1.0, -np.inf, 0.0, 1.0, 5.0, 4.0])
+    assert _hill(values, places, place) == top
+
+
+@pytest.mark.parametrize(("step", "count"), [(0.0, 1), (0.5, 2)])
+def test_a_hill_is_climbed_from_one_start(step, count):
+    """One parameter, one hill: beside a good one-step estimate its top is no other start, beside a bad one it is."""
+    data = draw("line", shift=0.4)
+    problem = Problem(line, data, [bend()]).with_live(["bend"])
+    base = fitting.fit(problem, problem.null())
+    starts = starting_points(problem, base.x, problem.live[0], np.array([step]), Settings())
+    assert len(starts) == count
+    np.testing.assert_allclose(starts[0][problem.layout["bend.c"].index], step, atol=1e-6)
