@@ -26,6 +26,12 @@ _RETURNS: Final = 3
 """Times that a search may find its starting fit to be no optimum."""
 _REVISIONS: Final = 4
 """Earlier choices that are looked at again after each step."""
+_REVISED: Final = 5
+"""Effects that are refitted in full where an earlier choice is looked at again, beside that choice, at most."""
+_NEARER: Final = 0.5
+"""Nats by which a fit has to be better to be another one."""
+_WITHIN: Final = 0.25
+"""Share of what another way gained by which one may fall short of it for its choices to be looked at again."""
 _NEARLY: Final = 3.0
 """Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect; by which
 one family of a site has to be better than effects that stand in for it."""
@@ -92,7 +98,10 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         rest = _refitted_without(end.problem, end.fitted, field)
         key = jax.random.fold_in(key, 1)
         goal = credit(problem, end.fitted, base)
-        others = _forward(rest.problem, rest.fitted, key, settings, say, base=base, banned=field, goal=goal)
+        begun = _without_trial(steps[0], rest.fitted, field)
+        others = _forward(
+            rest.problem, rest.fitted, key, settings, say, base=base, banned=field, goal=goal, begun=begun
+        )
         ways.append([*steps[:-1], *others])
     reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
     pair = _promising(ways, reached - base.log_evidence, settings)
@@ -171,21 +180,28 @@ def _forward(
     base: fitting.Fit | None = None,
     banned: str | None = None,
     goal: float = -np.inf,
+    begun: Step | None = None,
 ) -> list[Step]:
     """Steps from a fit, which may have effects already, each followed by a look at earlier choices.
 
     Such looks may lead in a circle, since what is given up is judged otherwise than what is taken: the one with most credit
-    is its end. Where there is a goal, a credit that another way has reached already, steps too short for it are not taken.
+    is its end. Where there is a goal, a credit that another way has reached already, steps too short for it are not taken,
+    and earlier choices are looked at again near it only. What was begun is a step from the same fit, whose view and refits
+    are taken over.
     """
     steps: list[Step] = []
-    fitted, returns = start, 0
+    fitted, returns = begun.view.fitted if begun else start, 0
     base = start if base is None else base
     visited: dict[frozenset[str], View] = {}
     while True:
         if frozenset(fitted.effects) in visited:
             most = max(visited.values(), key=lambda view: credit(view.problem, view.fitted, base))
             return [*steps, Step(most, Trials(most.problem, {}), None)]
-        seen = _looked(problem, fitted, jax.random.fold_in(key, len(steps)), settings, say)
+        seen = (
+            begun.view
+            if begun
+            else _looked(problem, fitted, jax.random.fold_in(key, len(steps)), settings, say)
+        )
         little = seen.promise < settings.minor * (fitted.log_evidence - base.log_evidence)
         if (
             little
@@ -195,9 +211,11 @@ def _forward(
         ):
             return [*steps, Step(seen, Trials(problem, {}), None)]
         visited[frozenset(fitted.effects)] = seen
-        trials = tried(seen, settings, say, banned=banned)
+        trials = begun.trials if begun else tried(seen, settings, say, banned=banned)
         problem = trials.problem
-        better = without(problem, seen.fitted, trials.fits, settings.polished) if returns < _RETURNS else None
+        may_return = returns < _RETURNS and begun is None
+        better = without(problem, seen.fitted, trials.fits, settings.polished) if may_return else None
+        begun = None
         if better is not None:
             say("found a better fit without them: starting again from there")
             del visited[frozenset(fitted.effects)]
@@ -207,10 +225,21 @@ def _forward(
         steps.append(Step(seen, trials, accepted))
         if accepted is None:
             return steps
-        keys = jax.random.fold_in(key, 1000 + len(steps))
-        steps += _revised(steps[-1], base, keys, settings, say, banned=banned)
+        near = (1 - _WITHIN) * goal + _WITHIN * base.log_evidence
+        if credit(problem, trials.fits[accepted], base) > near:
+            keys = jax.random.fold_in(key, 1000 + len(steps))
+            steps += _revised(steps[-1], base, keys, settings, say, banned=banned)
         reached = steps[-1].end
         problem, fitted = reached.problem, reached.fitted
+
+
+def _without_trial(step: Step, fitted: fitting.Fit, name: str) -> Step | None:
+    """A step from the same fit whose refits do without one effect; None from another fit, or where no refit is left."""
+    before = step.view.fitted
+    if fitted.effects != before.effects or fitted.log_evidence > before.log_evidence + _NEARER:
+        return None
+    rest = {other: one for other, one in step.trials.fits.items() if other != name}
+    return replace(step, trials=replace(step.trials, fits=rest), accepted=None) if rest else None
 
 
 def _is_hopeless(seen: View, base: fitting.Fit, goal: float, settings: Settings, banned: str | None) -> bool:
@@ -249,6 +278,7 @@ def _revised(
     The first choice was made while the other effects were still in the data, and may have been made for them.
     """
     looked = {frozenset(last.view.fitted.effects)}
+    settings = replace(settings, candidates=min(settings.candidates, _REVISED))
     for i in range(_REVISIONS):
         reached = last.end
         chosen = reached.fitted.effects

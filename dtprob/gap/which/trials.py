@@ -177,8 +177,8 @@ def _chosen(
     """The best candidates by score; where the gap is large, in turn with the best of two other lists.
 
     One is of those that move what is expected: whatever is wrong looks like noise, which then has the largest scores. The
-    other is by the scans, which do not start from the same likelihood, so that their gains cannot be compared: each
-    has its turn.
+    other, at the first step, is by the scans, which do not start from the same likelihood, so that their gains cannot be
+    compared: each has its turn.
     """
     screening = seen.screening
     at_fit = scans[_AT_FIT] if scans else {}
@@ -190,7 +190,7 @@ def _chosen(
         and _affordable(seen.problem, name)
     ]
     by_score = _by_gain(able, screening.log_bayes_factor)
-    if not scans:
+    if seen.promise <= _LARGE_GAP:
         return [screening.names[i] for i in by_score[: settings.candidates]]
     ranked = []
     for found in scans:

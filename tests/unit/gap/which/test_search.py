@@ -101,3 +101,69 @@ def test_a_way_that_cannot_reach_what_another_one_has_is_left(promise, goal, is_
     assert hopeless(("a",), goal) == is_hopeless
     assert not hopeless((), 1e6)
     assert not hopeless(("a",), -np.inf)
+
+
+def fitted_as(effects, evidence):
+    return SimpleNamespace(effects=effects, log_evidence=evidence)
+
+
+@pytest.mark.parametrize(
+    ("effects", "evidence", "is_taken"), [((), 10.3, True), ((), 50.0, False), (("b",), 10.0, False)]
+)
+def test_a_step_is_taken_over_from_the_same_fit_alone(effects, evidence, is_taken):
+    problem = SimpleNamespace()
+    fits = {name: fitted_as((name,), 20.0) for name in ("a", "field")}
+    view = SimpleNamespace(fitted=fitted_as((), 10.0), problem=problem)
+    step = search.Step(view, Trials(problem, fits), "field")
+    found = search._without_trial(step, fitted_as(effects, evidence), "field")
+    if is_taken:
+        assert (set(found.trials.fits), found.accepted, found.view) == ({"a"}, None, view)
+    else:
+        assert found is None
+    alone = search.Step(view, Trials(problem, {"field": fits["field"]}), "field")
+    assert search._without_trial(alone, fitted_as((), 10.0), "field") is None
+
+
+@pytest.mark.parametrize(("goal", "is_revised"), [(-np.inf, True), (11.0, True), (30.0, False)])
+def test_choices_are_looked_at_again_near_a_goal_alone(monkeypatch, goal, is_revised):
+    """Nine nats are within a quarter of eleven, and not of thirty."""
+    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "ab"])
+    first = SimpleNamespace(effects=(), log_evidence=0.0, within=lambda problem: problem)
+    second = SimpleNamespace(effects=("a",), log_evidence=9.0, within=lambda problem: problem)
+    revised = []
+
+    def looked(problem, fitted, *_, **__):
+        return SimpleNamespace(
+            problem=problem, fitted=fitted, promise=50.0, alarmed=lambda _: not fitted.effects
+        )
+
+    monkeypatch.setattr(search, "_looked", looked)
+    monkeypatch.setattr(search, "_is_hopeless", lambda *_: False)
+    monkeypatch.setattr(search, "tried", lambda *_, **__: Trials(problem, {"a": second}))
+    monkeypatch.setattr(search, "best", lambda *_: "a")
+    monkeypatch.setattr(search, "without", lambda *_: None)
+    monkeypatch.setattr(search, "_revised", lambda *_, **__: revised.append(1) or [])
+    search._forward(problem, first, jax.random.key(0), Settings(), lambda _: None, goal=goal)
+    assert bool(revised) == is_revised
+
+
+def test_a_step_that_was_begun_costs_no_look_and_no_refits(monkeypatch):
+    problem = SimpleNamespace(effects=[SimpleNamespace(name="a", kind="mean")])
+    first = SimpleNamespace(effects=(), log_evidence=0.0, within=lambda problem: problem)
+    second = SimpleNamespace(effects=("a",), log_evidence=9.0, within=lambda problem: problem)
+    looks = []
+
+    def looked(problem, fitted, *_, **__):
+        looks.append(fitted.effects)
+        return SimpleNamespace(problem=problem, fitted=fitted, promise=50.0, alarmed=lambda _: False)
+
+    view = SimpleNamespace(problem=problem, fitted=first, promise=50.0, alarmed=lambda _: True)
+    begun = search.Step(view, Trials(problem, {"a": second}), None)
+    monkeypatch.setattr(search, "_looked", looked)
+    monkeypatch.setattr(search, "tried", lambda *_, **__: pytest.fail("refitted anew"))
+    monkeypatch.setattr(search, "without", lambda *_: pytest.fail("looked for a better fit anew"))
+    monkeypatch.setattr(search, "best", lambda *_: "a")
+    monkeypatch.setattr(search, "_revised", lambda *_, **__: [])
+    steps = search._forward(problem, first, jax.random.key(0), Settings(), lambda _: None, begun=begun)
+    assert looks == [("a",)]
+    assert steps[-1].view.fitted is second

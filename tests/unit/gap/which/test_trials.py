@@ -20,7 +20,7 @@ def effect(name):
     )
 
 
-def chosen(scores, scans, count, absorbed=(), noise=()):
+def chosen(scores, scans, count, absorbed=(), *, noise=(), promise=1000.0):
     screening = SimpleNamespace(
         names=NAMES,
         absorbed_by=["gain" if name in absorbed else None for name in NAMES],
@@ -28,7 +28,7 @@ def chosen(scores, scans, count, absorbed=(), noise=()):
         log_bayes_factor=np.array([scores.get(name, -1.0) for name in NAMES]),
     )
     problem = SimpleNamespace(effects=[effect(name) for name in NAMES])
-    seen = cast("Any", SimpleNamespace(screening=screening, problem=problem))
+    seen = cast("Any", SimpleNamespace(screening=screening, problem=problem, promise=promise))
     found = [{n: Found(gain, np.zeros(0), np.zeros(1)) for n, gain in scan.items()} for scan in scans]
     return trials._chosen(seen, found, Settings(candidates=count), None)
 
@@ -43,7 +43,14 @@ def test_what_looks_like_noise_leaves_room_for_what_moves_the_mean():
     scores = {"near": 90.0, "far": 80.0, "swap": 70.0, "tilt": 8.0, "drift": 6.0}
     noise = ("near", "far", "swap")
     assert chosen(scores, [{"wall": 50.0}, {}], 5, noise=noise) == ["near", "tilt", "wall", "far", "drift"]
-    assert chosen(scores, [], 5, noise=noise) == ["near", "far", "swap", "tilt", "drift"]
+    later = chosen(scores, [], 5, noise=noise)  # scans are for the first step
+    assert later == ["near", "tilt", "far", "drift", "swap"]
+
+
+def test_a_small_gap_is_judged_by_scores_alone():
+    scores = {"near": 90.0, "far": 80.0, "swap": 70.0, "tilt": 8.0, "drift": 6.0}
+    found = chosen(scores, [], 5, noise=("near", "far", "swap"), promise=90.0)
+    assert found == ["near", "far", "swap", "tilt", "drift"]
 
 
 def test_what_gains_nothing_or_is_absorbed_is_not_refitted():
