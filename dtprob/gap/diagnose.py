@@ -25,7 +25,7 @@ from dtprob.gap.model.nulls import check_nulls
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.locate import most_gained
+from dtprob.gap.where.locate import most_left
 from dtprob.gap.which.classes import credible
 from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.search import search
@@ -122,7 +122,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
         folds = list(closed.fold_fits(last.problem, last.fitted, assignment))
         held_after = closed.judged(last.problem, folds)
     wrong = [s for s in last.location.sites if s.p_value <= settings.level / 2]
-    remains, left = bool(wrong), most_gained(wrong)
+    remains, left = bool(wrong), most_left(wrong)
     floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     fraction = (
         closed.closed_fraction(held_before, held_after, floor, keys[2]) if last.fitted.effects else None

@@ -29,6 +29,8 @@ _COLUMNS: Final = 16
 """Entries of a last axis up to which each is looked at."""
 _MOST_OF_STRETCHES: Final = 1 << 16
 """Entries of a site of which stretches are looked at."""
+_MOST_BLOCKS: Final = 1 << 13
+"""Stretches of one axis by those of another that are looked at."""
 
 type Along = Callable[[str, int], Sequence[Curves]]
 type Over = Sequence[tuple[Quantity, Sequence[Curves]]]
@@ -235,7 +237,7 @@ def _size(site: Site, axes: Sequence[int]) -> int:
 
 
 def _stretches(site: Site) -> Iterator[Pattern]:
-    """Stretches of the last axis of what lies along one or two, those of each position of the first apart."""
+    """Stretches of the last axis of what lies along one or two, those of each position and each stretch of the first."""
     shape = site.value.shape
     if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_STRETCHES:
         return
@@ -243,6 +245,11 @@ def _stretches(site: Site) -> Iterator[Pattern]:
         each = sparse.kron(sparse.identity(shape[0]), found.values, "csr") if len(shape) > 1 else found.values
         label = f"{found.label} x {site.axes[0]}" if len(shape) > 1 else found.label
         yield Pattern(label, tuple(range(len(shape))), replace(found, label=label, values=each))
+        for first in stretches(shape[0], site.axes[0]) if len(shape) > 1 else ():
+            if first.extent[0] * found.extent[0] <= _MOST_BLOCKS:
+                blocks = sparse.kron(first.values, found.values, "csr")
+                label = f"block of {site.axes[0]} and {site.axes[1]}"
+                yield Pattern(label, (0, 1), replace(found, label=label, values=blocks, overlaps=True))
 
 
 def _cycles(site: Site) -> Iterator[Pattern]:

@@ -77,6 +77,17 @@ def most_gained(found: Iterable[SiteFinding]) -> float:
     return max((one.gain for one in found if one.gain is not None), default=0.0)
 
 
+def most_left(found: Iterable[SiteFinding]) -> float:
+    """Nats that are left at the worst of these sites at least.
+
+    Of a moment that nothing a model computes would move, such as what goes together, about -log p, as a likelihood ratio of
+    it would have; not where it may be the shadow of another site.
+    """
+    sites = tuple(found)
+    told = (-math.log(max(one.p_value, 1e-300)) for one in sites if one.gain is None and not one.last)
+    return max(most_gained(sites), max(told, default=0.0))
+
+
 @dataclass(frozen=True)
 class Location:
     """Maps of the gap at one fit; the suspects come in order of falling evidence.

@@ -27,8 +27,16 @@ _MOST: Final = 1 << 16
 """Entries of an observation up to which it is looked at."""
 _HEAVIEST: Final = 4.0
 """Kurtosis over replicates up to which a sum of products of outcomes is looked at; 3 of a normal one."""
+_TOLD: Final = 3.3
+"""The same, told by the rows' own kurtosis and the number of products."""
 _OUTPUTS: Final = 8
 """Entries of a last axis up to which each pair is looked at."""
+_LATEST: Final = 4
+"""Positions by which what goes together may be apart, at most."""
+_LONG: Final = 8
+"""Positions of an axis from which on that is looked at."""
+_MOST_PAIRS: Final = 4096
+"""Pairs of components and outputs up to which each is."""
 _MOMENTS: Final = ("spread", "skewness", "tails", "circularity", "dependence")
 """First words of kinds that are no change of values."""
 
@@ -75,6 +83,8 @@ def further_moments(
                 if not known.is_outcome or _is_near_normal(scores[1:]):
                     pattern = Pattern(axes[kept[0]] if kept else "common", kept)
                     yield name, Family(kind, pattern, np.ones(())), scores
+        for kind, scores in _delayed(products[name], axes, is_outcome=known.is_outcome):
+            yield name, Family(kind, Pattern("each", ()), np.ones(())), scores
 
 
 def _pooled(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
@@ -124,6 +134,47 @@ def _dependence(
     for name, other in others.items():
         if other.shape == row.shape:
             yield f"dependence on {name}", _product(row, other)
+
+
+def _delayed(row: np.ndarray, axes: tuple[str, ...], *, is_outcome: bool) -> Iterator[tuple[str, np.ndarray]]:
+    """Sums (n, entry) of the products of rows (n, component, *entry) with those some positions before on an axis.
+
+    Each component and entry of a short last axis with each; real rows only. Of outcomes those are left out that are too
+    rare for sums of their products to vary as sums of many do, as their own tails say: of data and replicates together.
+    """
+    if np.iscomplexobj(row):
+        return
+    has_outputs = row.ndim > 3 and 1 < row.shape[-1] <= _OUTPUTS
+    several = row if has_outputs else row[..., None]
+    if (several.shape[1] * several.shape[-1]) ** 2 > _MOST_PAIRS:
+        return
+    tail = _kurtosis(several)
+    for i, axis in enumerate(axes[:-1] if has_outputs else axes):
+        n, along = row.shape[2 + i], np.moveaxis(several, 2 + i, 2)
+        for lag in range(1 if has_outputs else 2, _LATEST + 1 if n >= _LONG else 0):
+            later, sooner = along[:, :, lag:], along[:, :, :-lag]
+            scores = _coincidences(later, sooner)
+            terms = later[0, 0, ..., 0].size
+            steady = 3 + (np.outer(tail, tail).reshape(-1) - 3) / terms < _TOLD
+            scores = (scores - scores[1:].mean(axis=0)) * (steady if is_outcome else 1.0)
+            before = "the one" if lag == 1 else f"those {lag}"
+            yield f"dependence on {before} before along {axis}", scores
+
+
+def _coincidences(later: np.ndarray, sooner: np.ndarray) -> np.ndarray:
+    """Sums (n, entry) of products of rows (n, component, *position, output), for each pair of components and outputs."""
+    n, parts, last = len(later), later.shape[1], later.shape[-1]
+    one, other = (
+        r.reshape(n, parts, -1, last).swapaxes(2, 3).reshape(n, parts * last, -1) for r in (later, sooner)
+    )
+    return (one @ other.swapaxes(1, 2)).reshape(n, -1)
+
+
+def _kurtosis(row: np.ndarray) -> np.ndarray:
+    """Of each component and output of rows (n, component, *position, output), over all else."""
+    each = np.moveaxis(row, 1, -2).reshape(-1, row.shape[1] * row.shape[-1])
+    square = np.maximum((each**2).mean(axis=0), 1e-300)
+    return (each**4).mean(axis=0) / square**2
 
 
 def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -247,6 +247,22 @@ def test_cycles_of_each_period_take_turns():
     assert cycles(47, "slot") == ()
 
 
+def test_a_block_of_days_and_hours_is_noticed_where_no_stretch_of_one_day_is():
+    """Six days by seven hours, 1.3 standard deviations: 3.4 over the hours of one day, 8.4 over all."""
+    rng = np.random.default_rng(8)
+    gradients = rng.normal(size=(200, 50, 24))
+    gradients[0, 20:26, 17:24] += 1.3
+    site = deterministic("level", ("day", "hour"), np.ones((50, 24)), gradients)
+    found = {f.label: family_test(f, s) for f, s in families(lambda *_: (), (), site)}
+    assert found["additive, block of day and hour"].p_value < 1e-4
+    assert (
+        found["additive, stretch of hour x day"].p_value
+        > 1e3 * found["additive, block of day and hour"].p_value
+    )
+    longer = deterministic("level", ("day", "hour"), np.ones((400, 24)), rng.normal(size=(3, 400, 24)))
+    assert not any("block" in f.label for f, _ in families(lambda *_: (), (), longer))
+
+
 def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
     value = np.zeros((21, 8, 2))
     value.reshape(168, 2)[::7, 1] = 1.0

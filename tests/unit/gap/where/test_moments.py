@@ -1,6 +1,7 @@
 """Skewness, tails and dependence of observations: noticed and named where they are there, silent where they are not."""
 
 import contextlib
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -20,8 +21,8 @@ from dtprob.gap.tails import family_wise
 from dtprob.gap.where.bounded import skewness, tails
 from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import family_test
-from dtprob.gap.where.locate import locate
-from dtprob.gap.where.moments import further_moments, moment
+from dtprob.gap.where.locate import SiteFinding, locate, most_left
+from dtprob.gap.where.moments import _delayed, further_moments, moment
 from dtprob.models.declaration import model
 
 LINKS, TIMES, OUTPUTS = 30, 20, 3
@@ -95,9 +96,25 @@ def shared(seed):
     return noise
 
 
+def echoed(seed):
+    """The first output comes back in the last one, three times later."""
+    noise = normal(seed)
+    noise[0, :, 3:, 2] = 0.4 * noise[0, :, :-3, 0] + np.sqrt(1 - 0.4**2) * noise[0, :, 3:, 2]
+    return noise
+
+
+def recurring(seed):
+    noise = normal(seed)
+    for t in range(2, TIMES):
+        noise[0, :, t] = 0.3 * noise[0, :, t - 2] + np.sqrt(1 - 0.3**2) * noise[0, :, t]
+    return noise
+
+
 @pytest.mark.parametrize(
     ("noise", "site", "expected"),
     [
+        (echoed, "y", "dependence on those 3 before along time"),
+        (recurring, "y", "dependence on those 2 before along time"),
         (skewed, "y", "skewness"),
         (heavy, "z", "spread"),  # of single entries, and tails
         (remembered, "y", "dependence along time"),
@@ -123,12 +140,50 @@ def test_nothing_is_noticed_where_nothing_is_wrong():
         tests = [
             family_test(family, scores) for _, family, scores in further_moments(problem, fitted.x, stacked)
         ]
-        assert len(tests) == 2 * 6 * 4 + 4
+        assert len(tests) == 2 * (6 * 4 + 2 * 4) + 4
         smallest = np.stack([test.null for test in tests], axis=1).min(axis=1)
         found.append(family_wise(np.array([min(test.p_value for test in tests)]), smallest)[0])
     for level in (0.01, 0.1):
         assert (np.array(found) <= level).sum() <= stats.binom.isf(1e-3, len(found), 1.3 * level)
     assert min(found) > 1e-5
+
+
+@pytest.mark.parametrize(("rate", "links"), [(0.02, 6), (0.1, 6), (0.1, 60)])
+def test_rare_outcomes_that_nothing_ties_together_go_by_no_later_one(rate, links):
+    """With the 99 replicates of a first look; where coincidences are too few they are not looked at."""
+    rng, found = np.random.default_rng(5), []
+    for _ in range(150):
+        drawn = rng.uniform(size=(100, 1, links, 12, 4)) < rate
+        row = (drawn - rate) / np.sqrt(rate * (1 - rate))
+        tests = [
+            family_test(Family(kind, Pattern("each", ()), np.ones(())), scores)
+            for kind, scores in _delayed(row, ("link", "time", "output"), is_outcome=True)
+        ]
+        smallest = np.stack([test.null for test in tests], axis=1).min(axis=1)
+        found.append(family_wise(np.array([min(test.p_value for test in tests)]), smallest)[0])
+    assert (np.array(found) <= 0.01).sum() <= stats.binom.isf(1e-3, len(found), 0.013)
+    assert min(found) > 1e-5
+
+
+def test_an_outcome_that_follows_another_three_later_is_noticed_by_its_pair():
+    rng = np.random.default_rng(6)
+    drawn = rng.uniform(size=(100, 1, 60, 12, 4)) < 0.2
+    drawn[0, 0, :, 3:, 1] |= drawn[0, 0, :, :-3, 2] & (rng.uniform(size=(60, 9)) < 0.4)
+    row = (drawn - 0.2) / 0.4
+    every = dict(_delayed(row, ("link", "time", "output"), is_outcome=True))
+    scores = every["dependence on those 3 before along time"]
+    z = scores[0] / scores[1:].std(axis=0)
+    assert np.unravel_index(np.argmax(np.abs(z)), (4, 4)) == (1, 2)
+    assert z.max() > 5
+    assert len(every) == 8
+
+
+def test_what_goes_together_leaves_what_its_chance_tells_unless_it_is_a_shadow():
+    values = SiteFinding("y", "additive, along time", 1e-9, 12.0)
+    together = SiteFinding("y", "dependence along time, common", 1e-20, None)
+    assert most_left([values, together]) == pytest.approx(20 * np.log(10))
+    assert most_left([values, replace(together, last=True)]) == 12.0
+    assert most_left([]) == 0.0
 
 
 def test_one_far_row_of_many_is_no_tail():
