@@ -5,12 +5,13 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, cast, get_type_hints
+from typing import Any, Literal, NewType, cast, get_type_hints
 
 from dtprob.errors import InputError, unknown_name
 
 type Phase = Literal["coherent", "per_packet", "none"]
 type Options = Mapping[str, Any]
+Share = NewType("Share", float)
 
 PHASES: tuple[Phase, ...] = ("coherent", "per_packet", "none")
 
@@ -121,12 +122,15 @@ class DiagnosisSection:
         polished: how many fits are freed from local optima of the unknown parameters at each step, beside
             fitted effects at most one; 0 for none.
         max_effects: the largest set of effects that is looked for.
+        relevance: share of the gap that causes have to close to be named where something is left. Less of it suits
+            data whose twin is known to lack more than is on the list.
         tolerance_db: residual error that does not matter, in dB below the signal; of powers, their rms error in dB.
     """
 
     candidates: int = 8
     polished: int = 3
     max_effects: int = 3
+    relevance: Share = Share(0.75)
     tolerance_db: float | None = None
 
 
@@ -313,6 +317,7 @@ _KINDS: dict[Any, tuple[str, Any]] = {
     int: ("a whole number from 0", _is_whole),
     int | None: ("a whole number from 1", lambda value: _is_whole(value) and value > 0),
     float | None: ("a positive number", lambda value: _is_number(value) and 0 < value < float("inf")),
+    Share: ("a number from 0 to 1", lambda value: _is_number(value) and 0 <= value <= 1),
     bool: ("true or false", lambda value: isinstance(value, bool)),
     str | tuple[str, ...]: ("'all', a list of names, or 'module:name'", _is_names),
     tuple[str, ...]: ("a list of names", lambda value: isinstance(value, list) and _is_names(value)),

@@ -40,7 +40,7 @@ class Settings:
     grid: int = 32
     starts: int = 2
     credibility: float = 0.9
-    relevance: float = 0.5
+    relevance: float = 0.75
     field_relevance: float = 0.9
     minor: float = 0.03
     tolerance_db: float | None = None

@@ -77,9 +77,12 @@ def test_effort_of_a_diagnosis_can_be_said(tmp_path):
 
     plain = load_case(written(tmp_path, SHORT)).diagnosis
     assert Settings(**dataclasses.asdict(plain)) == Settings()
-    asked = "[diagnosis]\npolished = 0\nmax_effects = 1\ntolerance_db = 20\n"
+    asked = "[diagnosis]\npolished = 0\nmax_effects = 1\ntolerance_db = 20\nrelevance = 0.5\n"
     case = load_case(written(tmp_path, f"{SHORT}{asked}"))
     assert (case.diagnosis.polished, case.diagnosis.max_effects, case.diagnosis.tolerance_db) == (0, 1, 20.0)
+    assert case.diagnosis.relevance == 0.5
+    with pytest.raises(InputError, match="a number from 0 to 1"):
+        load_case(written(tmp_path, f"{SHORT}[diagnosis]\nrelevance = 2\n"))
     with pytest.raises(InputError, match="a whole number from 0"):
         load_case(written(tmp_path, f"{SHORT}[diagnosis]\ncandidates = -1\n"))
 
