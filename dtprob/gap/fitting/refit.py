@@ -139,7 +139,7 @@ def _along(
 ) -> tuple[float, list[tuple[float, np.ndarray]]]:
     """The log posterior at a point, and the local maxima on lines through x: position, scale, and whether one-sided.
 
-    Those that a climb from the point leads to are left out, unless they are higher than the point.
+    The only one of a line is left out, since a climb from the point leads there, too, unless it is higher than the point.
     """
     half = np.linspace(-2.5, 2.5, 2 * settings.grid + 1)
     fine = np.geomspace(1e-3, 0.1, settings.grid // 4)
@@ -152,27 +152,15 @@ def _along(
         trials.append(line)
     values = np.asarray(problem.compiled.profile(np.concatenate([point[None], *trials])))
     reached, low, peaks = float(values[0]), 1, []
-    for (position, _, _), line in zip(lines, trials, strict=True):
-        v, on_line = values[low : low + len(line)], line[:, position]
+    # of several lines none may lead through the point
+    least = reached + _SAME if len(lines) == 1 else reached
+    for line in trials:
+        v = values[low : low + len(line)]
         low += len(line)
-        hill = _hill(v, on_line, float(point[position]))
-        least = (
-            reached + _SAME if len(lines) == 1 else reached
-        )  # of several lines none may lead through the point
-        peaks += [(float(v[k]), line[k]) for k in local_maxima(v) if k != hill or v[k] > least]
+        tops = local_maxima(v)
+        if len(tops) > 1 or v[tops].max(initial=-np.inf) > least:
+            peaks += [(float(v[k]), line[k]) for k in tops]
     return reached, peaks
-
-
-def _hill(values: np.ndarray, places: np.ndarray, place: float) -> int:
-    """The local maximum (its index) that a climb along a line from a place on it ends at."""
-    at = int(np.argmin(np.abs(places - place)))
-    finite = np.where(np.isfinite(values), values, -np.inf)
-    while True:
-        around = [k for k in (at - 1, at + 1) if 0 <= k < len(finite)]
-        higher = max(around, key=lambda k: finite[k])
-        if finite[higher] <= finite[at]:
-            return at
-        at = higher
 
 
 def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[np.ndarray]:

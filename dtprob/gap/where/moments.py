@@ -173,8 +173,7 @@ def _coincidences(later: np.ndarray, sooner: np.ndarray) -> np.ndarray:
 def _kurtosis(row: np.ndarray) -> np.ndarray:
     """Of each component and output of rows (n, component, *position, output), over all else."""
     each = np.moveaxis(row, 1, -2).reshape(-1, row.shape[1] * row.shape[-1])
-    square = np.maximum((each**2).mean(axis=0), 1e-300)
-    return (each**4).mean(axis=0) / square**2
+    return (each**4).mean(axis=0) / np.maximum((each**2).mean(axis=0) ** 2, 1e-300)
 
 
 def _product(one: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ import pytest
 
 from dtprob.effects import catalogue
 from dtprob.gap.fitting import fit as fitting
-from dtprob.gap.fitting.refit import _hill, refit, starting_points
+from dtprob.gap.fitting.refit import refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.models.declaration import declare
@@ -45,13 +45,6 @@ def test_edges_are_looked_for_beside_the_best_size():
     assert min(abs(start[edge].item() - 0.56) for start in starts) < 0.06
     found = refit(problem, base, effects[0], starts)
     np.testing.assert_allclose(found.x[edge], np.mean(x[:, 0] <= 0.56), atol=0.01)
-
-
-@pytest.mark.parametrize(("place", "top"), [(-2.0, 1), (-0.4, 1), (0.6, 7), (2.0, 7)])
-def test_a_climb_ends_on_the_hill_that_it_starts_on(place, top):
-    places = np.linspace(-2.0, 2.0, 9)
-    values = np.array([0.0, 3.0, 2.0, 1.0, -np.inf, 0.0, 1.0, 5.0, 4.0])
-    assert _hill(values, places, place) == top
 
 
 @pytest.mark.parametrize(("step", "count"), [(0.0, 1), (0.5, 2)])
