@@ -15,7 +15,7 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
     """What a Gauss-Newton step at x needs: scores and curvatures of the free coordinates."""
     directions = basis(problem, active)
     e, w = (np.asarray(part) for part in problem.compiled.linearised(x, directions))
-    prior_gradient, hessian = problem.compiled.prior(x, directions)
+    prior_gradient, hessian, effect_curvature = _prior_at(problem, active, x, directions)
     g_index, l_index = active.global_index, active.local_index
     n = len(g_index)
     weighted = np.asarray(active.weights)[:, None]
@@ -24,12 +24,9 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
     flat = (e.size, n)
     curvature = (shared * weighted[..., None]).reshape(flat).T @ shared.reshape(flat)
     cross, local = transposed[:, :n] @ w[..., n:], transposed[:, n:] @ w[..., n:]
-    _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
-    prior_gradient = prior_gradient + effect_gradient
     curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
     if problem.volume is not None and n:
         weights, volume = np.asarray(active.weights), problem.volume
-        prior_gradient[volume.index] += weights @ volume.gradient(x)
         free = np.flatnonzero(np.isin(volume.index, g_index))
         place = np.searchsorted(g_index, volume.index[free])
         curvature[np.ix_(place, place)] -= np.tensordot(weights, volume.bend, 1)[np.ix_(free, free)]
@@ -48,17 +45,25 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
     )
 
 
+def _prior_at(
+    problem: Problem, active: Active, x: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Slope of all priors and of the volume; the base model's curvature along directions; that of effects' priors."""
+    gradient, hessian = problem.compiled.prior(x, directions)
+    _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
+    gradient = gradient + effect_gradient
+    if problem.volume is not None and len(active.global_index):
+        gradient[problem.volume.index] += np.asarray(active.weights) @ problem.volume.gradient(x)
+    return gradient, hessian, effect_curvature
+
+
 def rescored(problem: Problem, active: Active, x: np.ndarray, system: System) -> System:
     """A system whose scores are those at x, its curvatures as they were but for those of effects' priors.
 
     A gradient costs a few evaluations, however many coordinates are free; a system two for each of them.
     """
     g_index, l_index = active.global_index, active.local_index
-    prior_gradient, _ = problem.compiled.prior(x, np.zeros((0, problem.dimension)))
-    _, effect_gradient, bend = effect_prior(problem, active, x)
-    prior_gradient = prior_gradient + effect_gradient
-    if problem.volume is not None and len(g_index):
-        prior_gradient[problem.volume.index] += np.asarray(active.weights) @ problem.volume.gradient(x)
+    prior_gradient, _, bend = _prior_at(problem, active, x, np.zeros((0, problem.dimension)))
     slope = problem.compiled.slope(x, active.weights)
     own = slope
     if l_index.size and (active.weights != 1).any():

@@ -18,7 +18,7 @@ from dtprob.gap.settings import Settings
 
 _LINES = 12
 """Parameters of an effect along which starting points are looked for."""
-_BETTER = 0.5
+BETTER = 0.5
 """Nats by which another optimum has to be higher."""
 _SWEPT = 3
 """Parameters of an effect whose large sizes are tried with the clusters' angles found anew."""
@@ -91,7 +91,7 @@ def without(
             x = _at_null(problem, trials[effect.name].x, [effect.name])
             fits.append(fitting.fit(problem, x, before.effects, spread=before.spread))
     found = max(fits, key=lambda f: f.log_evidence, default=before)
-    return _polish(problem, found) if found.log_evidence > before.log_evidence + _BETTER else None
+    return _polish(problem, found) if found.log_evidence > before.log_evidence + BETTER else None
 
 
 def starting_points(

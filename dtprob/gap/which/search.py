@@ -15,7 +15,7 @@ import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.marginal_mode import faithful
-from dtprob.gap.fitting.refit import at_null_except, refit, starting_points, without
+from dtprob.gap.fitting.refit import BETTER, at_null_except, refit, starting_points, without
 from dtprob.gap.how_far.remainder import alone
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -28,8 +28,6 @@ _REVISIONS: Final = 4
 """Earlier choices that are looked at again after each step."""
 _REVISED: Final = 5
 """Effects that are refitted in full where an earlier choice is looked at again, beside that choice, at most."""
-_NEARER: Final = 0.5
-"""Nats by which a fit has to be better to be another one."""
 _WITHIN: Final = 0.25
 """Share of what another way gained by which one may fall short of it for its choices to be looked at again."""
 _NEARLY: Final = 3.0
@@ -236,7 +234,7 @@ def _forward(
 def _without_trial(step: Step, fitted: fitting.Fit, name: str) -> Step | None:
     """A step from the same fit whose refits do without one effect; None from another fit, or where no refit is left."""
     before = step.view.fitted
-    if fitted.effects != before.effects or fitted.log_evidence > before.log_evidence + _NEARER:
+    if fitted.effects != before.effects or fitted.log_evidence > before.log_evidence + BETTER:
         return None
     rest = {other: one for other, one in step.trials.fits.items() if other != name}
     return replace(step, trials=replace(step.trials, fits=rest), accepted=None) if rest else None

@@ -8,32 +8,21 @@ import pytest
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.density import rescored, system_at, value_of
 from dtprob.gap.model.problem import Problem
-from tests.unit.gap.examples import (
-    bend,
-    counts,
-    draw,
-    hierarchy,
-    jitter,
-    labels,
-    line,
-    logistic,
-    spread,
-    tone,
-)
+from tests.unit.gap.examples import MODELS, bend, draw, jitter
 
-MODELS = {f.__name__: f for f in (line, hierarchy, spread, logistic, counts, labels, tone)}
+NAMES = ("line", "hierarchy", "spread", "logistic", "counts", "labels", "tone")
 
 
 def live(name, effects=()):
     """A model's problem with effects free, a point off its mode, and another one beside it."""
     made = {"bend": bend(), "jitter": jitter()}
-    problem = Problem(MODELS[name], draw(name), [made[e] for e in effects] or [bend()]).with_live(effects)
+    problem = Problem(MODELS[name][0], draw(name), [made[e] for e in effects] or [bend()]).with_live(effects)
     rng = np.random.default_rng(3)
     x = problem.null() + 0.1 * rng.normal(size=problem.dimension)
     return problem, x, x + 0.05 * rng.normal(size=problem.dimension)
 
 
-@pytest.mark.parametrize("name", list(MODELS))
+@pytest.mark.parametrize("name", NAMES)
 def test_scores_are_the_slope_of_the_log_posterior(name):
     problem, x, _ = live(name)
     active = activate(problem)
@@ -49,7 +38,7 @@ def test_scores_are_the_slope_of_the_log_posterior(name):
 
 @pytest.mark.parametrize(
     ("name", "effects"),
-    [*((name, ()) for name in MODELS), ("line", ("bend", "jitter")), ("hierarchy", ("jitter",))],
+    [*((name, ()) for name in NAMES), ("line", ("bend", "jitter")), ("hierarchy", ("jitter",))],
 )
 def test_scores_made_anew_are_those_of_a_new_system(name, effects):
     problem, x, beside = live(name, effects)
