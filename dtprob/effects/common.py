@@ -108,8 +108,8 @@ def reference_power(data: Data) -> Float[np.ndarray, " 1"] | None:
 
 @jax.jit
 def phasor(phase: Float[Array, "*n"]) -> Complex[Array, "*n"]:
-    """exp(j phase), exactly 1 at phase 0."""
-    return lax.complex(jnp.cos(phase), jnp.sin(phase))
+    """exp(j phase), exactly 1 at phase 0; told before it is broadcast, not once for each entry of what it turns."""
+    return lax.optimization_barrier(lax.complex(jnp.cos(phase), jnp.sin(phase)))
 
 
 def square(value: Complex[Array, "*n"]) -> Float[Array, "*n"]:
