@@ -181,7 +181,9 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
     remains = evidence.after.site_p_value <= level
     if cause.closed_fraction is None:
         return "UNLISTED" if remains else "UNDETERMINED"
-    if remains and cause.closed_fraction.mean < _relevance(evidence, settings):
+    is_poor = cause.closed_fraction.mean < _relevance(evidence, settings)
+    is_too_large = not cause.plausible and _are_fields(evidence)
+    if remains and (is_poor or is_too_large):
         return "UNLISTED"
     leaves = remains and (cause.closed_fraction.mean < 1 - settings.minor or _are_fields(evidence))
     if cause.probability < settings.credibility:

@@ -24,9 +24,9 @@ def evidence(kind, p_after):
     )
 
 
-def cause(closed, probability=0.99):
+def cause(closed, probability=0.99, plausible=True):
     fraction = None if closed is None else ClosedFraction(closed, closed - 0.1, min(closed + 0.1, 1.0))
-    return SimpleNamespace(closed_fraction=fraction, probability=probability)
+    return SimpleNamespace(closed_fraction=fraction, probability=probability, plausible=plausible)
 
 
 @pytest.mark.parametrize(
@@ -55,6 +55,20 @@ def test_verdicts(kind, closed, p_after, verdict):
 )
 def test_equally_good_sets_that_leave_something_are_imitations(closed, p_after, verdict):
     assert decide(evidence("mean", p_after), (cause(closed, 0.6),), Settings()) == verdict
+
+
+@pytest.mark.parametrize(
+    ("kind", "p_after", "verdict"),
+    [
+        ("variance", 1e-6, "UNLISTED"),
+        ("variance", 0.5, "LISTED"),
+        ("mean", 1e-6, "LISTED"),
+    ],
+)
+def test_a_random_field_too_large_for_what_it_is_that_leaves_something_is_an_imitation(
+    kind, p_after, verdict
+):
+    assert decide(evidence(kind, p_after), (cause(0.99, plausible=False),), Settings()) == verdict
 
 
 def test_no_cause_is_unlisted_where_a_site_is_wrong():
