@@ -35,11 +35,16 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
         problem: in which the effect is live.
         fitted: the fit without it.
         effect: what is added.
-        starts: flat vectors; not looked at for a variance effect, whose field starts at zero where it was found.
+        starts: flat vectors; the field of a variance effect starts at zero, too, and spreads as far as it starts.
     """
     names = (*fitted.effects, effect.name)
     if effect.kind == "variance":
-        return fitting.fit(problem, _at_null(problem, fitted.x, [effect.name]), names)
+        index = problem.field_of(effect).index
+        fits = [fitting.fit(problem, _at_null(problem, fitted.x, [effect.name]), names)]
+        for x in starts:
+            spread = {**fitted.spread, effect.name: float(np.sqrt(np.mean(x[index] ** 2)))}
+            fits.append(fitting.fit(problem, x, names, spread=spread))
+        return max(fits, key=lambda f: f.log_evidence)
     best = max((fitting.fit(problem, x, names) for x in starts), key=lambda f: f.log_evidence)
     return faithful(problem, settled(problem, best), starts)
 

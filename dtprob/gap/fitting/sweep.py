@@ -148,6 +148,22 @@ def turned(problem: Problem, x: Float[np.ndarray, " dimension"], terms: Terms) -
     return x
 
 
+def turns(problem: Problem) -> Float[np.ndarray, " turn"]:
+    """By how much clusters' own angles are turned in trials; by nothing where they have none."""
+    return _circle() if any(one.is_angle for one in _locals(problem)) else np.zeros(1)
+
+
+def turned_by(
+    problem: Problem, x: Float[np.ndarray, " dimension"], turn: Float[np.ndarray, " cluster"]
+) -> Float[np.ndarray, " dimension"]:
+    """The point with all of each cluster's own angles turned alike."""
+    x = x.copy()
+    for one in _locals(problem):
+        if one.is_angle:
+            x[one.positions] += turn
+    return x
+
+
 def _kept(
     x: np.ndarray, value: np.ndarray, moved: np.ndarray, new: np.ndarray, coordinates: tuple[_Local, ...]
 ) -> np.ndarray:

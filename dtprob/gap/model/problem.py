@@ -324,13 +324,13 @@ class Problem:
             if effect.kind == "variance":
                 name, shape = effect.site_name(FIELD), self.field_shapes[effect.name]
                 entries.append((name, effect.name, shape))
-                axis = self._axis_of_clusters(effect)
+                axis = self.axis_of_clusters(effect)
                 if name not in found and axis is not None and axis < len(shape) and shape[axis] == count:
                     found[name] = Own(axis, np.arange(count))
             entries += [(effect.site_name(p.name), effect.name, p.shape) for p in effect.fitted]
         return make_layout(entries, found)
 
-    def _axis_of_clusters(self, effect: Effect) -> int | None:
+    def axis_of_clusters(self, effect: Effect) -> int | None:
         """Along which axis of its field a variance effect has entries for each cluster."""
         if effect.name in self.per_cluster:
             return 0

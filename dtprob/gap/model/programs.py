@@ -15,6 +15,7 @@ from dtprob.gap.model.quick import Hoisted
 from dtprob.gap.model.rewrites import (
     derivative,
     field_energy,
+    field_shifts,
     null_vector,
     place_energies,
     place_scores,
@@ -55,6 +56,7 @@ class Programs:
         self._tangents = {family: self._tangents_of(own) for family, own in families.items()}
         self._trials = {family: self._trials_of(own) for family, own in families.items()}
         self._place_scores: dict[str, Hoisted] = {}
+        self._field_shifts: dict[str, Hoisted] = {}
         self._effects = {e.name: e for e in (*means, *fields)}
         self._nulls = {name: np.asarray(null_vector(e)) for name, e in self._effects.items()}
 
@@ -140,6 +142,26 @@ class Programs:
                 for name, part in portion.items():
                     moved = {site: shift[: len(part)] for site, shift in shifts[name].items()}
                     yield name, slice(start, start + len(part)), moved
+
+    def field_shifts(
+        self, name: str, values: Mapping[str, jax.Array], fields: np.ndarray
+    ) -> Iterator[tuple[slice, dict[str, jax.Array]]]:
+        """The rewritten sites of a variance effect less their values at fields (trial, *field), in portions.
+
+        Yields:
+            which of the trials, and for each site the shifts (trial, *site).
+        """
+
+        def shifts(values: Any, fields: jax.Array, arrays: Any) -> dict[str, jax.Array]:
+            context = Context(eqx.combine(arrays, self._static), values)
+            return field_shifts(self._effects[name], values, context, fields)
+
+        run = self._field_shifts.setdefault(name, Hoisted(shifts))
+        for start in range(0, len(fields), TRIALS):
+            given = fields[start : start + TRIALS]
+            filled = np.concatenate([given, np.zeros((TRIALS - len(given), *given.shape[1:]))])
+            found = run(dict(values), filled, self._arrays)
+            yield slice(start, start + len(given)), {s: shift[: len(given)] for s, shift in found.items()}
 
     def _filled(self, name: str, portion: Mapping[str, np.ndarray]) -> np.ndarray:
         """One portion of an effect's trials, the null where there are none."""

@@ -87,6 +87,22 @@ def trial_shifts(
     return jax.vmap(one)(sizes)
 
 
+def field_shifts(
+    effect: Effect, values: Mapping[str, jax.Array], context: Context, fields: jax.Array
+) -> dict[str, jax.Array]:
+    """Rewritten sites less their values (trial, *site) at fields (trial, *field) of unit spread."""
+    unit = {p.name: jnp.full(p.shape, p.null if p.is_place else 1.0) for p in effect.parameters}
+
+    def one(field: jax.Array) -> dict[str, jax.Array]:
+        result = {}
+        for site, rewrite in effect.rewrites.items():
+            new = jnp.asarray(rewrite(values[site], {**unit, FIELD: field}, context))
+            result[site] = new.astype(values[site].dtype) - values[site]
+        return result
+
+    return jax.vmap(one)(fields)
+
+
 def place_energies(
     effect: Effect,
     values: Mapping[str, jax.Array],

@@ -17,6 +17,7 @@ from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
+from dtprob.gap.which.each import scan_each
 from dtprob.gap.which.scan import Found, scan, scan_anew, scan_anew_about_centre
 
 type Say = Callable[[str], None]
@@ -41,7 +42,7 @@ _POLISHED_LATER: Final = 1
 """New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
-_LOOKS: Final = (scan, scan_anew, scan_anew_about_centre)
+_LOOKS: Final = (scan, scan_anew, scan_anew_about_centre, scan_each)
 """Scans, where scores may miss it."""
 _AT_FIT: Final = _LOOKS.index(scan_anew)
 """That of whole sizes at the fit. What gains there is no move of a nuisance, which the fit would have made."""
@@ -167,7 +168,10 @@ def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], setti
 
 def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:
     x = problem.translate(found.x, scanned)
-    x[problem.layout.of(effect)] = found.parameters
+    if effect.kind == "variance":
+        x[problem.field_of(effect).index] = found.parameters
+    else:
+        x[problem.layout.of(effect)] = found.parameters
     return x
 
 
