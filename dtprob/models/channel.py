@@ -160,7 +160,8 @@ def _channel(
     tx_response = site("tx_response", array_response(tx_array, departure, paths.frequency, 1.0))
     rx_response = site("rx_response", array_response(rx_array, arrival, paths.frequency, -1.0))
     frequency_response = site("frequency_response", jnp.ones(shape[4], jnp.result_type(gain)))
-    response = field.frequency_response(paths, subcarrier_frequency, delay) * frequency_response
+    response = site("path_response", field.frequency_response(paths, subcarrier_frequency, delay))
+    response = response * frequency_response
     phasor = jax.lax.complex(jnp.cos(path_phase), jnp.sin(path_phase))
     noiseless = field.synthesize(gain, response, rx_response, tx_response, phasor)
     noiseless = site("noiseless_channel", noiseless)

@@ -34,6 +34,7 @@ AXES = {
     "path_phase": ("link", "snapshot", "path"),
     "tx_response": ("link", "path", "tx_antenna"),
     "rx_response": ("link", "path", "rx_antenna"),
+    "path_response": ("link", "path", "subcarrier"),
     "frequency_response": ("subcarrier",),
     "noiseless_channel": CHANNEL_AXES,
     "noise_power": CHANNEL_AXES,

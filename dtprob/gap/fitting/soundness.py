@@ -101,13 +101,21 @@ def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
         found.append(
             f"what numpyro.factor adds ({names}) counts as a prior, and no gap is looked for in it; {remedy}"
         )
-    return (*found, *_misfit(problem, fitted), *_undetermined(problem, fitted))
+    return (*found, *_too_large(problem, fitted), *_misfit(problem, fitted), *_undetermined(problem, fitted))
 
 
 def idle(absorbed_by: Sequence[str | None]) -> list[str]:
     """A note where no candidate does anything, from what hides each of them."""
     is_idle = bool(absorbed_by) and set(absorbed_by) == {UNSEEN}
     return ["nothing observed depends on any of the effects"] if is_idle else []
+
+
+def _too_large(problem: Problem, fitted: Fit) -> list[str]:
+    """Sites that are not looked at, since they have many more entries than the data."""
+    sites = problem.compiled.sites(fitted.x)
+    moved = [n for n in problem.declaration.deterministic if np.issubdtype(sites[n].dtype, np.inexact)]
+    left = [n for n in moved if sites[n].size and n not in problem.float_sites]
+    return [f"no gap is looked for at {', '.join(left)}: too many entries beside the data"] if left else []
 
 
 def _misfit(problem: Problem, fitted: Fit) -> list[str]:

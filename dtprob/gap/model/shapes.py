@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import Any, cast
+from typing import Any, Final, cast
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,11 @@ from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import transform_of
 from dtprob.gap.model.running import Arrays, Runner, observations
 from dtprob.gap.observation import whiten
+
+_LARGEST: Final = 8_000_000
+"""Bytes of a site that may be perturbed in any case."""
+_PER_OBSERVATION: Final = 2
+"""Entries of a larger one for each observed value, at most."""
 
 
 def observed_shapes(
@@ -69,7 +74,11 @@ def shapes_of_fields(
 def perturbed_sites(
     runner: Runner, effects: Sequence[Effect], arrays: Arrays
 ) -> dict[str, jax.ShapeDtypeStruct]:
-    """Deterministic sites on which a perturbation makes sense, in the largest shape that an effect gives them."""
+    """Deterministic sites on which a perturbation makes sense, in the largest shape that an effect gives them.
+
+    Large ones beside the data (an entry for every path at every subcarrier) only where an effect moves them: their
+    gradients are kept for a hundred replicates.
+    """
     declared = runner.declared
     names = declared.declaration.deterministic
 
@@ -84,7 +93,14 @@ def perturbed_sites(
                 return grown
 
     sites = cast("dict[str, Any]", jax.eval_shape(run, arrays))
-    return {n: s for n, s in sites.items() if jnp.issubdtype(s.dtype, jnp.inexact) and s.size}
+    observed = sum(site.size for site in declared.declaration.observed.values())
+    rewritten_ones = {site for effect in effects for site in effect.sites}
+
+    def is_kept(name: str, site: jax.ShapeDtypeStruct) -> bool:
+        small = site.size * site.dtype.itemsize <= _LARGEST or site.size <= _PER_OBSERVATION * observed
+        return jnp.issubdtype(site.dtype, jnp.inexact) and site.size > 0 and (small or name in rewritten_ones)
+
+    return {name: site for name, site in sites.items() if is_kept(name, site)}
 
 
 def _largest(

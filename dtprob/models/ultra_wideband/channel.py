@@ -183,7 +183,7 @@ def _received(
     tx_response = site("tx_response", array_response(None, departure, paths.frequency, 1.0))
     rx_response = site("rx_response", array_response(None, arrival, paths.frequency, -1.0))
     common = site("frequency_response", unknown_pulse(subcarrier_frequency))
-    response = field.frequency_response(paths, subcarrier_frequency, delay)
+    response = site("path_response", field.frequency_response(paths, subcarrier_frequency, delay))
     traced = field.synthesize(gain, response, rx_response, tx_response, turn(path_phase))
     level = jnp.mean(jnp.real(traced) ** 2 + jnp.imag(traced) ** 2, axis=(1, 2, 3, 4))
     amplitude = site("receiver_gain", gain_law(level, receiver))

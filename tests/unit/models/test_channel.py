@@ -78,6 +78,14 @@ def test_the_channel_is_the_sum_of_its_paths(paths, data):
     np.testing.assert_allclose(found, by_hand(paths), rtol=1e-8, atol=1e-14)
 
 
+def test_each_path_has_a_response_over_the_band(paths, data):
+    """What a gap that depends on path and frequency at once shows at."""
+    found = run(ray_traced_channel, data, materials(paths))["path_response"]["value"]
+    mask, delay = np.asarray(paths.mask), np.asarray(paths.delay)
+    expected = np.exp(-2j * np.pi * (paths.frequency + FREQUENCY) * delay[..., None])
+    np.testing.assert_allclose(np.asarray(found)[mask], expected[mask], atol=1e-6)
+
+
 def test_phase_errors_turn_paths(paths, data):
     error = np.random.default_rng(1).uniform(-3, 3, (3, 2, 7))
     values = {**materials(paths), "phase_concentration": jnp.array(2.0), "phase_error": jnp.asarray(error)}

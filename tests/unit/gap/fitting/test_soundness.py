@@ -54,6 +54,12 @@ def improper(x, y=None):
     observed(numpyro.sample("a", dist.ImproperUniform(dist.constraints.real, (), ())) + x, y, x)
 
 
+def crowded(x, y=None):
+    """The data are means over a site of a million entries."""
+    each = numpyro.deterministic("each", jnp.broadcast_to(x[..., None], (*x.shape, 1_100_000 // x.size)))
+    observed(numpyro.sample("slope", dist.Normal(0.0, 3.0)) * each.mean(-1), y, x)
+
+
 def tied(x, y=None):
     """Two levels of which the data see the sum, and a term that ties them together."""
     floor, ceiling = (numpyro.sample(name, dist.Normal(0.0, 3.0)) for name in ("floor", "ceiling"))
@@ -210,3 +216,19 @@ def test_a_case_says_so_in_one_line(old, new, text, tmp_path, capsys):
     lines = [row for row in capsys.readouterr().err.splitlines() if "expected" in row]
     assert len(lines) == 1
     assert text in lines[0]
+
+
+def test_a_site_of_far_more_entries_than_the_data_is_not_looked_at_and_this_is_said():
+    x = inputs()
+    data = draw("line", x=x)
+    problem = Problem(crowded, data, [])
+    assert set(problem.float_sites) == {"mean"}
+    assert "no gap is looked for at each: too many entries beside the data" in notes(
+        problem, fit_base(problem, jax.random.key(0))
+    )
+    louder = Effect(
+        "louder",
+        {"each": lambda value, p, _: value * (1 + p["gain"])},
+        (Parameter("gain", dist.Normal(0.0, 1.0)),),
+    )
+    assert set(Problem(crowded, data, [louder]).float_sites) == {"mean", "each"}
