@@ -61,7 +61,8 @@ class _Point(NamedTuple):
 def scan_each(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Found]:
     """Random fields with each cluster's entries where they are best, or nowhere if what they gain there may be chance.
 
-    What clusters share stands once at the fit and once at the centre of its prior, as in `scan`.
+    Only those whose entries have several optima, which a fit from the null does not find. What clusters share stands once
+    at the fit and once at the centre of its prior, as in `scan`.
 
     Args:
         problem: the model and candidates on their data.
@@ -73,16 +74,19 @@ def scan_each(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str
     for anchor in (x, centre(problem, x)) if effects else ():
         around, null = surroundings(problem, anchor), problem.compiled.by_cluster(anchor)
         for effect in effects:
-            value, point = _best(_Trials(problem, around, effect), null)
+            tried = _Trials(problem, around, effect)
+            grid = _grid(tried)
+            if max(grid.counts) <= _number(1):
+                continue
+            value, point = _best(tried, grid, null)
             gain = float(value.sum()) - here
             if effect.name not in found or gain > found[effect.name].gain:
                 found[effect.name] = Found(gain, turned_by(problem, anchor, point.turn), point.entries)
     return found
 
 
-def _best(tried: _Trials, null: Float[np.ndarray, " cluster"]) -> tuple[np.ndarray, _Point]:
+def _best(tried: _Trials, grid: _Grid, null: Float[np.ndarray, " cluster"]) -> tuple[np.ndarray, _Point]:
     """Terms (cluster,) where entries and angles are best, the choice among trials paid for, and what these are."""
-    grid = _grid(tried)
     price = float(np.log(max(len(grid.points), 2)))
     value, kept = null, _Point(np.zeros((len(null), tried.entries)), np.zeros(len(null)))
     for peak in _peaks(grid, tried):
@@ -115,7 +119,6 @@ class _Trials:
         self.shape, self.axis = problem.field_shapes[effect.name], problem.axis_of_clusters(effect) or 0
         self.entries = int(np.prod(self.shape, dtype=int)) // problem.n_cluster
         self.spread = float(scales(effect)[sizes(effect)].max())
-
         self.turns = turns(problem)
 
     def __call__(
@@ -153,12 +156,17 @@ def _grid(tried: _Trials) -> _Grid:
 
 
 def _count(values: Float[np.ndarray, "trial cluster"]) -> int:
-    """An odd number of trials along one entry: so many for each peak of the cluster that has most of them."""
+    """How many trials there are along one entry, from the peaks of the cluster that has most of them; 1 if none matters."""
     told = values[:, np.ptp(np.maximum(values, values.max(axis=0) - _FAR_BELOW), axis=0) > _FLAT]
     if not told.size:
         return 1
     peaks = (told[1:-1] > told[:-2]) & (told[1:-1] >= told[2:])
-    return 2 * (_PER_WAVE * max(int(peaks.sum(axis=0).max()), 1) // 2) + 1
+    return _number(max(int(peaks.sum(axis=0).max()), 1))
+
+
+def _number(peaks: int) -> int:
+    """An odd number of trials for so many peaks, so that the null is among them."""
+    return 2 * (_PER_WAVE * peaks // 2) + 1
 
 
 def _peaks(grid: _Grid, tried: _Trials) -> Iterator[tuple[np.ndarray, _Point]]:
