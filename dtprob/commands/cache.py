@@ -3,6 +3,8 @@
 import hashlib
 import os
 import platform
+from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Final
 
@@ -33,16 +35,21 @@ def prune(folder: Path, largest: int) -> None:
     """Delete the oldest files of a folder until the others take at most so many bytes."""
     if not folder.is_dir():
         return
-    files = sorted(
-        ((entry.stat(), entry.path) for entry in os.scandir(folder) if entry.is_file()),
-        key=lambda found: found[0].st_mtime,
-    )
+    files = sorted(_files(folder), key=lambda found: found[0].st_mtime)
     total = sum(stat.st_size for stat, _ in files)
     for stat, path in files:
         if total <= largest:
             return
-        Path(path).unlink(missing_ok=True)  # another process may prune too
+        Path(path).unlink(missing_ok=True)
         total -= stat.st_size
+
+
+def _files(folder: Path) -> Iterator[tuple[os.stat_result, str]]:
+    """Files of a folder; those that another process prunes meanwhile are left out."""
+    for entry in os.scandir(folder):
+        with suppress(FileNotFoundError):
+            if entry.is_file():
+                yield entry.stat(), entry.path
 
 
 def _processor() -> str:

@@ -25,3 +25,13 @@ def test_the_folder_follows_the_user_and_the_processor(tmp_path, monkeypatch):
     assert here.is_relative_to(tmp_path / "dtprob")
     monkeypatch.setattr(cache, "_processor", lambda: "another one")
     assert cache.cache_folder() != here
+
+
+def test_a_file_that_another_process_deletes_meanwhile_is_no_error(tmp_path, monkeypatch):
+    for name in ("kept", "gone"):
+        (tmp_path / name).write_bytes(bytes(100))
+    entries = list(os.scandir(tmp_path))
+    (tmp_path / "gone").unlink()
+    monkeypatch.setattr(os, "scandir", lambda _: entries)
+    cache.prune(tmp_path, 50)
+    assert not list(tmp_path.iterdir())
