@@ -78,9 +78,10 @@ def site_shares(found: Sequence[SiteFinding], gap: float, closed: Mapping[str, f
 
 
 def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, float, float]:
-    """Values by their shares, moments by their p-values."""
+    """Values by their shares, moments by their p-values; those that rounding alone parts stay in their order."""
     found, share = one
-    return found.last, found.p_value > _TOLD, -(share or 0.0) * (found.moment is None), found.p_value
+    closed = round(share or 0.0, 6) if found.moment is None else 0.0
+    return found.last, found.p_value > _TOLD, -closed, float(f"{found.p_value:.6g}")
 
 
 def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:

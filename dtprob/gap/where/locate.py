@@ -137,7 +137,8 @@ def locate(
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
     entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
-    ordered = tuple(sorted(_shadows_last(seen.findings), key=lambda f: (f.last, f.p_value, -(f.gain or 0.0))))
+    towards_data = {name: -i for i, name in enumerate(problem.declaration.sites)}
+    ordered = tuple(sorted(_shadows_last(seen.findings), key=lambda f: (*_rank(f), towards_data[f.site])))
     strays = differences(problem, drawn)
     return Location(ordered, blocks, maps, seen.p_value, suspected, entries, strays)
 
@@ -266,6 +267,11 @@ def _shadows_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
     of_moments = min((f.p_value for f in findings if f.moment is not None), default=1.0)
     sure, by_noise = of_values <= _SURE, of_moments < of_values**2
     return [replace(f, last=sure and (f.moment is None) == by_noise) for f in findings]
+
+
+def _rank(found: SiteFinding) -> tuple[bool, float, float]:
+    """The surest first, then the largest gain; sites that rounding alone parts, one acting through another, are equal."""
+    return found.last, float(f"{found.p_value:.6g}"), -float(f"{found.gain or 0.0:.6g}")
 
 
 def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> SiteFinding:

@@ -22,7 +22,7 @@ SITES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         ),
         "material_mismatch": _MATERIALS,
         "thickness_mismatch": ("thickness",),
-        "dispersive_walls": (*_MATERIALS, "path_gain", "frequency_response"),
+        "dispersive_walls": (*_MATERIALS, "path_gain", "path_response", "frequency_response"),
         "antenna_orientation": ("path_gain", *_RESPONSES),
         **dict.fromkeys(
             ("element_spacing", "array_calibration", "mutual_coupling", "beam_squint"),
