@@ -61,8 +61,8 @@ class _Point(NamedTuple):
 def scan_each(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Found]:
     """Random fields with each cluster's entries where they are best, or nowhere if what they gain there may be chance.
 
-    Only those whose entries have several optima, which a fit from the null does not find. What clusters share stands once
-    at the fit and once at the centre of its prior, as in `scan`.
+    Only those whose entries have several optima, which a fit from the null does not find, and that any cluster has entries
+    of. What clusters share stands once at the fit and once at the centre of its prior, as in `scan`.
 
     Args:
         problem: the model and candidates on their data.
@@ -80,6 +80,8 @@ def scan_each(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str
                 continue
             value, point = _best(tried, grid, null)
             gain = float(value.sum()) - here
+            if not point.entries.any():
+                continue
             if effect.name not in found or gain > found[effect.name].gain:
                 found[effect.name] = Found(gain, turned_by(problem, anchor, point.turn), point.entries)
     return found
