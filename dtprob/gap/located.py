@@ -6,6 +6,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Final
 
 from dtprob.gap.evidence import Evidence
+from dtprob.gap.tails import told_apart
 from dtprob.gap.where.locate import Location, SiteFinding
 from dtprob.gap.where.reach import Told, reached, told
 
@@ -81,7 +82,7 @@ def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, float, flo
     """Values by their shares, moments by their p-values; those that rounding alone parts stay in their order."""
     found, share = one
     closed = round(share or 0.0, 6) if found.moment is None else 0.0
-    return found.last, found.p_value > _TOLD, -closed, float(f"{found.p_value:.6g}")
+    return found.last, found.p_value > _TOLD, -closed, told_apart(found.p_value)
 
 
 def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:

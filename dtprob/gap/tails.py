@@ -117,3 +117,8 @@ def field_log_bayes_factor(observed: np.ndarray, mean: np.ndarray, variance: np.
 def normal_quantile(log_p: np.ndarray) -> np.ndarray:
     """Normal quantile of an upper-tail probability given by its logarithm."""
     return -special.ndtri_exp(log_p)
+
+
+def told_apart(value: float) -> float:
+    """Six digits of a number: what rounding alone parts is equal."""
+    return float(f"{value:.6g}")

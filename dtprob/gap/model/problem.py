@@ -319,23 +319,28 @@ class Problem:
         entries: list[tuple[str, str | None, tuple[int, ...]]] = [
             (name, None, shapes[name]) for name in self.declaration.latent
         ]
-        found, count = dict(self.own), self.n_cluster
+        found = dict(self.own)
         for effect in self.live:
             if effect.kind == "variance":
                 name, shape = effect.site_name(FIELD), self.field_shapes[effect.name]
                 entries.append((name, effect.name, shape))
                 axis = self.axis_of_clusters(effect)
-                if name not in found and axis is not None and axis < len(shape) and shape[axis] == count:
-                    found[name] = Own(axis, np.arange(count))
+                if name not in found and axis is not None:
+                    found[name] = Own(axis, np.arange(self.n_cluster))
             entries += [(effect.site_name(p.name), effect.name, p.shape) for p in effect.fitted]
         return make_layout(entries, found)
 
     def axis_of_clusters(self, effect: Effect) -> int | None:
-        """Along which axis of its field a variance effect has entries for each cluster."""
-        if effect.name in self.per_cluster:
-            return 0
+        """Along which axis of its field a variance effect has an entry for each cluster; None where it has not."""
         axes, cluster = self.declaration.sites[effect.sites[0]].axes, self.declaration.cluster
-        return axes.index(cluster) if self.column is None and cluster in axes else None
+        if effect.name in self.per_cluster:
+            axis = 0
+        elif self.column is None and cluster in axes:
+            axis = axes.index(cluster)
+        else:
+            return None
+        shape = self.field_shapes[effect.name]
+        return axis if axis < len(shape) and shape[axis] == self.n_cluster else None
 
     # -- points ---------------------------------------------------------------------------------------------------
 

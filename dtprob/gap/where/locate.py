@@ -22,7 +22,7 @@ from dtprob.gap.model.conditioned import conditioned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
-from dtprob.gap.tails import family_wise
+from dtprob.gap.tails import family_wise, told_apart
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.where.curves import curves
 from dtprob.gap.where.data_columns import whole_columns
@@ -271,7 +271,7 @@ def _shadows_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
 
 def _rank(found: SiteFinding) -> tuple[bool, float, float]:
     """The surest first, then the largest gain; sites that rounding alone parts, one acting through another, are equal."""
-    return found.last, float(f"{found.p_value:.6g}"), -float(f"{found.gain or 0.0:.6g}")
+    return found.last, told_apart(found.p_value), -told_apart(found.gain or 0.0)
 
 
 def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> SiteFinding:

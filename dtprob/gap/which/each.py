@@ -80,19 +80,18 @@ def scan_each(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str
                 continue
             value, point = _best(tried, grid, null)
             gain = float(value.sum()) - here
-            if not point.entries.any():
-                continue
-            if effect.name not in found or gain > found[effect.name].gain:
+            is_best = effect.name not in found or gain > found[effect.name].gain
+            if point.entries.any() and is_best:
                 found[effect.name] = Found(gain, turned_by(problem, anchor, point.turn), point.entries)
     return found
 
 
 def _best(tried: _Trials, grid: _Grid, null: Float[np.ndarray, " cluster"]) -> tuple[np.ndarray, _Point]:
     """Terms (cluster,) where entries and angles are best, the choice among trials paid for, and what these are."""
-    price = float(np.log(max(len(grid.points), 2)))
+    price = float(np.log(len(grid.points)))
     value, kept = null, _Point(np.zeros((len(null), tried.entries)), np.zeros(len(null)))
     for peak in _peaks(grid, tried):
-        terms, point = _refined(tried, *peak, grid.spacing)
+        terms, point = _refined(tried, peak, grid.spacing)
         is_better = terms - price > value
         value = np.where(is_better, terms - price, value)
         kept = _Point(
@@ -106,22 +105,20 @@ def _is_each(problem: Problem, effect: Effect) -> bool:
     """Whether an effect is a random field of which every cluster has a few entries of its own."""
     if effect.kind == "mean" or effect.is_looked_for or not effect.rewrites:
         return False
-    shape = problem.field_shapes[effect.name]
-    axis = problem.axis_of_clusters(effect)
-    if axis is None or axis >= len(shape) or shape[axis] != problem.n_cluster:
-        return False
-    return int(np.prod(shape, dtype=int)) <= _ENTRIES * problem.n_cluster
+    size = int(np.prod(problem.field_shapes[effect.name], dtype=int))
+    return problem.axis_of_clusters(effect) is not None and size <= _ENTRIES * problem.n_cluster
 
 
 class _Trials:
     """What clusters add to the log posterior with entries of an effect's field at given values."""
 
     def __init__(self, problem: Problem, around: Surroundings, effect: Effect) -> None:
-        self.problem, self.around, self.effect = problem, around, effect
+        self.problem, self.effect, self.values = problem, effect, around.grown()
         self.shape, self.axis = problem.field_shapes[effect.name], problem.axis_of_clusters(effect) or 0
         self.entries = int(np.prod(self.shape, dtype=int)) // problem.n_cluster
         self.spread = float(scales(effect)[sizes(effect)].max())
         self.turns = turns(problem)
+        self.points = [turned_by(problem, around.x, np.full(problem.n_cluster, turn)) for turn in self.turns]
 
     def __call__(
         self, fields: Float[np.ndarray, "trial cluster entry"]
@@ -129,13 +126,10 @@ class _Trials:
         """Terms of the log posterior, -inf where they are not finite, and how far angles are turned for these."""
         rest = tuple(n for i, n in enumerate(self.shape) if i != self.axis)
         given = np.moveaxis(fields.reshape(len(fields), -1, *rest), 1, 1 + self.axis)
-        points = [
-            turned_by(self.problem, self.around.x, np.full(fields.shape[1], turn)) for turn in self.turns
-        ]
         parts = []
-        for part, shifts in self.problem.programs.field_shifts(self.effect.name, self.around.grown(), given):
+        for part, shifts in self.problem.programs.field_shifts(self.effect.name, self.values, given):
             count = part.stop - part.start
-            parts.append(np.stack([self.problem.compiled.shifted(x, shifts, count) for x in points]))
+            parts.append(np.stack([self.problem.compiled.shifted(x, shifts, count) for x in self.points]))
         values = np.nan_to_num(np.concatenate(parts, axis=1), nan=-np.inf, posinf=-np.inf)
         return values.max(axis=0), self.turns[values.argmax(axis=0)]
 
@@ -171,25 +165,28 @@ def _number(peaks: int) -> int:
     return 2 * (_PER_WAVE * peaks // 2) + 1
 
 
-def _peaks(grid: _Grid, tried: _Trials) -> Iterator[tuple[np.ndarray, _Point]]:
-    """Terms (cluster,) and where they are so at each cluster's highest peak, then at its second, and so on."""
-    clusters = np.arange(tried.problem.n_cluster)
-    values, turns = tried(np.repeat(grid.points[:, None], len(clusters), axis=1))
+def _peaks(grid: _Grid, tried: _Trials) -> Iterator[Float[np.ndarray, "cluster entry"]]:
+    """Entries at each cluster's highest peak, then at its second, and so on."""
+    values, _ = tried(np.repeat(grid.points[:, None], tried.problem.n_cluster, axis=1))
     shaped = values.reshape(*grid.counts, -1)
     around = ndimage.maximum_filter(shaped, size=(*(3 for _ in grid.counts), 1), mode="nearest")
     peaks = np.where(shaped >= around, shaped, -np.inf).reshape(values.shape)
     for chosen in np.argsort(-peaks, axis=0)[:_PEAKS]:
-        yield values[chosen, clusters], _Point(grid.points[chosen], turns[chosen, clusters])
+        yield grid.points[chosen]
 
 
 def _refined(
-    tried: _Trials, value: Float[np.ndarray, " cluster"], point: _Point, spacing: Float[np.ndarray, " entry"]
+    tried: _Trials, entries: Float[np.ndarray, "cluster entry"], spacing: Float[np.ndarray, " entry"]
 ) -> tuple[np.ndarray, _Point]:
-    """Terms at the best of closer and closer neighbours, each cluster's own, and where they are so."""
-    ways, clusters = np.array(list(itertools.product((-1, 0, 1), repeat=len(spacing)))), np.arange(len(value))
+    """Terms (cluster,) at the best of closer and closer neighbours, each cluster's own, and where they are so."""
+    ways, clusters = (
+        np.array(list(itertools.product((-1, 0, 1), repeat=len(spacing)))),
+        np.arange(len(entries)),
+    )
+    terms = turns = np.zeros(len(entries))
     for halving in range(1, _FINER + 1):
-        fields = point.entries + ways[:, None] * spacing / 2**halving
-        terms, turns = tried(fields)
-        chosen = terms.argmax(axis=0)
-        point, value = _Point(fields[chosen, clusters], turns[chosen, clusters]), terms[chosen, clusters]
-    return value, point
+        fields = entries + ways[:, None] * spacing / 2**halving
+        every, turned = tried(fields)
+        chosen = every.argmax(axis=0)
+        entries, terms, turns = fields[chosen, clusters], every[chosen, clusters], turned[chosen, clusters]
+    return terms, _Point(entries, turns)
