@@ -14,6 +14,7 @@ from dataclasses import dataclass
 
 import jax
 import numpy as np
+from jaxtyping import Bool
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.plausible import WHOLE, nulls, scales, sides
@@ -33,6 +34,8 @@ _SMALL, _LARGE = 0.02, 1.0
 _BENT = 0.4
 _DRAWS = 64
 _STEPS = 21
+_WIDE = 128
+"""Entries of a site up to which each is looked at for one that matters most."""
 
 
 @dataclass(frozen=True)
@@ -44,7 +47,9 @@ class Found:
     parameters: np.ndarray
 
 
-def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Found]:
+def scan(
+    problem: Problem, x: np.ndarray, names: Sequence[str], middle: np.ndarray | None = None
+) -> dict[str, Found]:
     """Effects that bend the log likelihood, each at its best plausible size.
 
     The nuisances stand once at the fit and once at the centre of their prior: a fit without the effect may have silenced
@@ -54,21 +59,22 @@ def scan(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Fou
         problem: the model and candidates on their data.
         x: the fit.
         names: candidates to look at.
+        middle: the centre of the prior, where it is known already; see `centre`.
     """
     means = _means(problem, names)
     small = {e.name: _lines(e, np.array([_SMALL, 2 * _SMALL, _LARGE, -_LARGE])) for e in means}
     found: dict[str, Found] = {}
-    for anchor in (x, centre(problem, x)):
+    for anchor in (x, centre(problem, x) if middle is None else middle):
         around = surroundings(problem, anchor)
         here = float(problem.compiled.shifted(anchor, {}, 1)[0].sum())
         probed = _likelihoods(problem, around, small)
-        bent = [e for e in means if _is_bent(probed[e.name] - here)]
+        bent = [e for e in means if _is_bent(probed[e.name] - here, sides(e)[:_SCANNED])]
         lines, likelihoods = _scanned(problem, around, bent, np.linspace(-_REACH, _REACH, _COARSE))
         waves = [e for e in bent if _is_wave(likelihoods[e.name])]
         for part, values in zip(_scanned(problem, around, waves, _FINE), (lines, likelihoods), strict=True):
             values.update(part)
         for name, values in likelihoods.items():
-            best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
+            best = int(np.argmax(_finite(values)))
             gain = float(values[best]) - here
             if name not in found or gain > found[name].gain:
                 found[name] = Found(gain, anchor, lines[name][best])
@@ -80,7 +86,8 @@ def scan_anew(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str
 
     Args:
         problem: the model and candidates on their data.
-        x: the fit; what clusters share stays there.
+        x: the fit, or the centre of the prior, since the fit may have bent what clusters share to what the twin lacks; it
+            stays there.
         names: candidates to look at.
     """
     effects = _means(problem, names)
@@ -107,35 +114,32 @@ def scan_anew(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str
     return found
 
 
-def scan_anew_about_centre(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Found]:
-    """The same with what clusters share at the centre of its prior: the fit may have bent it to what the twin lacks."""
-    return scan_anew(problem, centre(problem, x), names)
-
-
 def _means(problem: Problem, names: Sequence[str]) -> list[Effect]:
     return [e for e in problem.effects if e.kind == "mean" and e.rewrites and e.name in names]
 
 
 def centre(problem: Problem, x: np.ndarray) -> np.ndarray:
-    """Base nuisances at the centre of their prior, but for the one whose move back to the fit matters most (the noise)."""
+    """Base nuisances at the centre of their prior, but for the one whose move back to the fit matters most (the noise).
+
+    Of sites of few entries: many are levels or states, none of which matters most.
+    """
     draws = problem.prior_draws(jax.random.key(0), _DRAWS)
-    result = x.copy()
+    middle = x.copy()
     blocks = [b for b in problem.blocks_of(None) if not b.local]
     for block in blocks:
-        result[block.index[0]] = np.median(draws[:, block.index[0]], axis=0)
-    trials = []
-    for block in blocks:
-        for position in block.index[0]:
-            for value in np.quantile(draws[:, position], np.linspace(0.02, 0.98, _STEPS)):
-                moved = result.copy()
-                moved[position] = value
-                trials.append(moved)
-            moved = result.copy()
-            moved[position] = x[position]
-            trials.append(moved)
-    values = problem.compiled.profile(np.stack([result, *trials]))
-    best = int(np.argmax(np.where(np.isfinite(values), values, -np.inf)))
-    return result if best == 0 else trials[best - 1]
+        middle[block.index[0]] = np.median(draws[:, block.index[0]], axis=0)
+    best, found = _finite(problem.compiled.profile(middle[None]))[0], middle
+    for position in (i for b in blocks if b.size <= _WIDE for i in b.index[0]):
+        line = np.repeat(middle[None], _STEPS + 1, axis=0)
+        line[:, position] = [*np.quantile(draws[:, position], np.linspace(0.02, 0.98, _STEPS)), x[position]]
+        values = _finite(problem.compiled.profile(line))
+        if values.max() > best:
+            best, found = values.max(), line[int(values.argmax())]
+    return found
+
+
+def _finite(values: np.ndarray) -> np.ndarray:
+    return np.where(np.isfinite(values), values, -np.inf)
 
 
 def _scanned(
@@ -182,12 +186,16 @@ def _terms(
         yield name, part, np.nan_to_num(values, nan=-np.inf, posinf=-np.inf)
 
 
-def _is_bent(change: np.ndarray) -> bool:
-    """Whether the change of log likelihood at a large size is not what two small sizes promise, on any line."""
-    for one, two, plus, minus in change.reshape(-1, 4):
+def _is_bent(change: np.ndarray, sided: Bool[np.ndarray, " line"]) -> bool:
+    """Whether the change of log likelihood at a large size is not what two small sizes promise, on any line.
+
+    One that has only one side is tried at the same size twice.
+    """
+    for (one, two, plus, minus), is_sided in zip(change.reshape(-1, 4), sided, strict=True):
         curvature = (two - 2 * one) / (2 * _SMALL**2)
         slope = one / _SMALL - curvature * _SMALL
-        promised = np.array([slope * _LARGE + curvature * _LARGE**2, -slope * _LARGE + curvature * _LARGE**2])
+        sign = np.array([1.0, 1.0 if is_sided else -1.0])
+        promised = sign * slope * _LARGE + curvature * _LARGE**2
         if not np.all(np.isfinite([plus, minus])):
             return True
         if np.max(np.abs(promised - [plus, minus])) > _BENT * np.max(np.abs([plus, minus])) + 1.0:

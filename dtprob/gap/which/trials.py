@@ -11,14 +11,14 @@ from typing import Final
 import numpy as np
 from scipy.special import gammaln
 
-from dtprob.effects.effect import Effect
+from dtprob.effects.effect import FIELD, Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
 from dtprob.gap.which.each import scan_each
-from dtprob.gap.which.scan import Found, scan, scan_anew, scan_anew_about_centre
+from dtprob.gap.which.scan import Found, centre, scan, scan_anew
 
 type Say = Callable[[str], None]
 
@@ -42,10 +42,9 @@ _POLISHED_LATER: Final = 1
 """New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
-_LOOKS: Final = (scan, scan_anew, scan_anew_about_centre, scan_each)
-"""Scans, where scores may miss it."""
-_AT_FIT: Final = _LOOKS.index(scan_anew)
-"""That of whole sizes at the fit. What gains there is no move of a nuisance, which the fit would have made."""
+_AT_FIT: Final = 1
+"""Which of the scans is that of whole sizes at the fit. What gains there is no move of a nuisance, which the fit would have
+made."""
 
 
 @dataclass(frozen=True)
@@ -92,7 +91,7 @@ def tried(
     scans: list[dict[str, Found]] = []
     if not fitted.effects and seen.promise > _LARGE_GAP:
         say("scanning the effects' plausible sizes")
-        scans = [look(seen.problem, seen.fitted.x, screening.names) for look in _LOOKS]
+        scans = _scans(seen)
     chosen = [n for n in _chosen(seen, scans, settings, banned) if n not in known]
     problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
@@ -110,6 +109,18 @@ def tried(
     count = min(settings.polished, _POLISHED_LATER) if fitted.effects else settings.polished
     new = {name: one for name, one in trials.items() if name not in known}
     return Trials(problem, {**trials, **polished(problem, start, new, count)})
+
+
+def _scans(seen: View) -> list[dict[str, Found]]:
+    """What far looks find where scores may miss it."""
+    problem, x, names = seen.problem, seen.fitted.x, seen.screening.names
+    middle = centre(problem, x)
+    return [
+        scan(problem, x, names, middle),
+        scan_anew(problem, x, names),
+        scan_anew(problem, middle, names),
+        scan_each(problem, x, names, middle),
+    ]
 
 
 def _again(problem: Problem, at: Start) -> fitting.Fit:
@@ -182,14 +193,18 @@ def _chosen(
 
     One is of those that move what is expected: whatever is wrong looks like noise, which then has the largest scores. The
     other, at the first step, is by the scans, which do not start from the same likelihood, so that their gains cannot be
-    compared: each has its turn.
+    compared: each has its turn. One that nuisances absorb nearly whole is left out unless what is left of it is an alarm.
     """
     screening = seen.screening
     at_fit = scans[_AT_FIT] if scans else {}
     able = [
         i
         for i, name in enumerate(screening.names)
-        if (screening.absorbed_by[i] is None or (name in at_fit and at_fit[name].gain > _WORTH))
+        if (
+            screening.absorbed_by[i] is None
+            or screening.adjusted[i] <= settings.level / 2
+            or (name in at_fit and at_fit[name].gain > _WORTH)
+        )
         and name != banned
         and _affordable(seen.problem, name)
     ]
@@ -222,5 +237,7 @@ def _affordable(problem: Problem, name: str) -> bool:
     effect = next(e for e in problem.effects if e.name == name)
     if effect.kind == "mean":
         return True
-    size = int(np.prod(problem.field_shapes[name], dtype=int)) // problem.n_cluster
+    size = int(np.prod(problem.field_shapes[name], dtype=int))
+    if problem.axis_of_clusters(effect) is not None or effect.site_name(FIELD) in problem.own:
+        size //= problem.n_cluster
     return size <= _LARGEST_FIELD and size * problem.rows.gather.size <= _LARGEST_TANGENTS

@@ -16,7 +16,7 @@ from dtprob.gap.fitting.refit import starting_points
 from dtprob.gap.fitting.sweep import elsewhere, swept, turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.which.scan import scan, scan_anew, scan_anew_about_centre
+from dtprob.gap.which.scan import centre, scan, scan_anew
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
 
@@ -213,7 +213,7 @@ def test_what_the_fit_has_silenced_is_seen_about_the_priors_centre():
     assert x[problem.layout["all_loud"].index[0]] < -2.0
     assert "swap" not in scan(problem, x, ["swap"])
     assert "swap" not in scan_anew(problem, x, ["swap"])
-    found = scan_anew_about_centre(problem, x, ["swap"])["swap"]
+    found = scan_anew(problem, centre(problem, x), ["swap"])["swap"]
     assert found.gain > 20
     np.testing.assert_allclose(found.parameters, [1.0])
 

@@ -1,5 +1,7 @@
 """Entries of a random field wavelengths away from the null, found cluster by cluster."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -46,6 +48,23 @@ EACH = Effect(
     field_shape=lambda value, context: value.shape,
 )
 
+ALL = Effect(
+    "misplaced",
+    {"place": lambda value, p, context: value + p["displacement"]},
+    (Parameter("displacement", dist.Normal(0.0, 0.1).expand((2,)), unit="m"),),
+    instance="all",
+)
+FIRST = replace(
+    ALL,
+    rewrites={"place": lambda value, p, context: value.at[:6].add(p["displacement"])},
+    instance="first_six",
+)
+TURNED = replace(
+    ALL,
+    rewrites={"place": lambda value, p, context: value + p["displacement"] * value[:, ::-1] / 10.0},
+    instance="turned",
+)
+
 
 def received(moved, synchronised=True):
     """The problem of receivers that stand away from where they were recorded (receiver, axis), and its base fit."""
@@ -55,7 +74,7 @@ def received(moved, synchronised=True):
     phase += 0.0 if synchronised else rng.uniform(-np.pi, np.pi, (len(moved), 1))
     seen = np.stack([np.cos(phase), np.sin(phase)], -1) + 0.2 * rng.normal(size=(*phase.shape, 2))
     data = {"recorded": jnp.asarray(recorded), "synchronised": synchronised, "seen": jnp.asarray(seen)}
-    problem = Problem(beacons, data, [EACH])
+    problem = Problem(beacons, data, [EACH, ALL, FIRST, TURNED])
     return problem, fit_base(problem, jax.random.key(0))
 
 
@@ -85,6 +104,26 @@ def test_receivers_that_all_stand_wavelengths_away_are_found(synchronised):
     problem, base = received(moved, synchronised)
     found = scan_each(problem, base.x, [EACH.name])[EACH.name]
     np.testing.assert_allclose(refitted(problem, base, found), moved, atol=0.02)
+
+
+@pytest.mark.parametrize("synchronised", [True, False])
+@pytest.mark.parametrize(("effect", "touched"), [(ALL, 14), (FIRST, 6)])
+def test_what_several_receivers_share_is_found_in_place_of_a_field(effect, touched, synchronised):
+    moved = np.zeros((14, 2))
+    moved[:touched] = 0.13, -0.21
+    problem, base = received(moved, synchronised)
+    found = scan_each(problem, base.x, [EACH.name, ALL.name, FIRST.name, TURNED.name])
+    assert EACH.name not in found
+    assert max(found, key=lambda name: found[name].gain) == effect.name
+    np.testing.assert_allclose(found[effect.name].parameters, [0.13, -0.21], atol=0.02)
+
+
+def test_what_moves_receivers_each_by_something_else_is_no_field_with_entries_in_common():
+    moved = np.random.default_rng(1).normal(0.0, 0.1, (14, 2))
+    problem, base = received(moved)
+    found = scan_each(problem, base.x, [EACH.name, ALL.name, TURNED.name])
+    assert TURNED.name not in found
+    assert EACH.name in found
 
 
 @pytest.mark.parametrize("seed", range(3))
