@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dtprob.effects.common import (
-    CHANNEL_AXES,
     Data,
     Family,
     Sites,
@@ -33,6 +32,7 @@ from dtprob.effects.common import (
 )
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.elements import DIRECTION, arrays, ends, phase_rewrite
+from dtprob.effects.meaning import CHANNEL_AXES
 from dtprob.effects.unfolding import to_transmitter
 from dtprob.raytracing.beyond import with_all
 from dtprob.raytracing.field import frequency_response
@@ -155,14 +155,15 @@ def mutual_coupling(sites: Sites, data: Data) -> list[Effect]:
 
 
 def _neighbours(array: Float[np.ndarray, "antenna 3"]) -> Float[np.ndarray, "kind antenna antenna"]:
-    """Which elements are neighbours, a mask for each displacement up to its sign."""
+    """Which elements are neighbours, a mask for each displacement up to its sign; those at one place are a kind too."""
     step = array[:, None] - array[None]
     distance = np.linalg.norm(step, axis=-1)
-    nearest = distance[distance > 0].min()
+    nearest = np.min(distance, where=distance > 0, initial=np.inf)
+    nearest = nearest if np.isfinite(nearest) else 1.0
     rounded = np.round(step / nearest, 3)
     first = np.take_along_axis(rounded, np.argmax(rounded != 0, axis=-1)[..., None], axis=-1)
     rounded = rounded * np.where(first < 0, -1.0, 1.0)
-    near = (distance > 0) & (distance <= _NEIGHBOUR * nearest)
+    near = ~np.eye(len(array), dtype=bool) & (distance <= _NEIGHBOUR * nearest)
     kinds = np.unique(rounded[near], axis=0)
     return (np.all(rounded == kinds[:, None, None], axis=-1) & near).astype(float)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -14,42 +14,8 @@ from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from dtprob.effects.effect import Effect, Parameter, Rewrite
+from dtprob.effects.meaning import SiteLike, means
 from dtprob.raytracing.paths import NONE, PathSet
-
-
-class SiteLike(Protocol):
-    """What a family looks at in a declared site."""
-
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Shape of the site's value."""
-        ...
-
-    @property
-    def axes(self) -> tuple[str, ...]:
-        """Name of each dimension."""
-        ...
-
-    @property
-    def kind(self) -> str:
-        """Latent, deterministic or observed."""
-        ...
-
-    @property
-    def distribution(self) -> str | None:
-        """Name of the distribution's class."""
-        ...
-
-    @property
-    def is_complex(self) -> bool:
-        """Whether the value is complex."""
-        ...
-
-    @property
-    def is_circular(self) -> bool:
-        """Whether the values are angles."""
-        ...
-
 
 type Sites = Mapping[str, SiteLike]
 type Data = Mapping[str, Any]
@@ -77,8 +43,10 @@ def place(name: str, tried: Float[np.ndarray, " n"], unit: str, *, centre: float
 
 
 def offers(sites: Sites, *names: str) -> bool:
-    """Whether the model computes all these sites."""
-    return all(name in sites and sites[name].kind == "deterministic" for name in names)
+    """Whether the model computes all these sites, and means by them what the effects do; see `dtprob.effects.meaning`."""
+    return all(
+        name in sites and sites[name].kind == "deterministic" and means(sites[name], name) for name in names
+    )
 
 
 def of_model(sites: Sites, table: Mapping[str, Rewrite]) -> dict[str, Rewrite]:
@@ -283,7 +251,3 @@ def on_axis(vector: jax.Array, axis: str, axes: Sequence[str]) -> jax.Array:
     shape = [1] * len(axes)
     shape[list(axes).index(axis)] = vector.shape[0]
     return vector.reshape(shape)
-
-
-CHANNEL_AXES: Final = ("link", "snapshot", "rx_antenna", "tx_antenna", "subcarrier")
-"""Axes of `noiseless_channel` and `noise_power`."""

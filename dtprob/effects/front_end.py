@@ -10,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from dtprob.effects.common import (
-    CHANNEL_AXES,
     Band,
     Data,
     Family,
@@ -30,6 +29,7 @@ from dtprob.effects.common import (
     phasor,
 )
 from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.meaning import CHANNEL_AXES
 
 _RIPPLES: Final = np.arange(1.5, 16.25, 0.5)
 """Cycles of a ripple over the band: an echo between two of them loses a fifth of its power at most."""

@@ -185,5 +185,5 @@ def slopes(data: Data, least: int = 2) -> list[Region]:
             return (x[:, index] - middle) / half
 
         whole = np.ones(len(column), bool)
-        found.append(Region(f"x{index}_slope", f"in proportion to feature {index}", along, whole))
+        found.append(Region(f"x{index}_slope", f"ever more along feature {index}", along, whole))
     return found

@@ -24,7 +24,7 @@ _REACH: Final = 1.0
 
 def regional_bias(sites: Sites, data: Data) -> list[Effect]:
     """The predictor is off by a constant everywhere, in a region, or by value of a feature; or ever more along one."""
-    if not offers(sites, "predicted_label"):
+    if not _offers(sites, data, "predicted_label"):
         return []
     unit = _unit(data)
     whole = np.ones(len(data["x"]), bool)
@@ -35,7 +35,7 @@ def regional_bias(sites: Sites, data: Data) -> list[Effect]:
             {"predicted_label": _added(region.weight)},
             (normal("bias", unit), *region.parameters),
             instance=region.name,
-            physics=f"Labels are higher than predicted {region.text}, by a constant.",
+            physics=f"Labels are higher than predicted {region.text}.",
             source="y + b w(x), w of largest value 1.",
             requires=("x",),
         )
@@ -65,7 +65,7 @@ def _by_value(index: int, values: np.ndarray, unit: float) -> Effect:
 
 def scale_bias(sites: Sites, data: Data) -> list[Effect]:
     """The predictor exaggerates or shrinks what it predicts, and is right at a level that nobody knows."""
-    if not offers(sites, "predicted_label"):
+    if not _offers(sites, data, "predicted_label"):
         return []
     typical = 0.3
 
@@ -85,7 +85,7 @@ def scale_bias(sites: Sites, data: Data) -> list[Effect]:
 
 def label_noise(sites: Sites, data: Data) -> list[Effect]:
     """Labels are noisier in a region of a feature than elsewhere, or ever more along a feature."""
-    if not offers(sites, "label_deviation"):
+    if not _offers(sites, data, "label_deviation"):
         return []
 
     def louder(weight: Weight) -> Any:
@@ -100,7 +100,7 @@ def label_noise(sites: Sites, data: Data) -> list[Effect]:
             {"label_deviation": louder(region.weight)},
             (normal("log_ratio", 0.7), *region.parameters),
             instance=region.name,
-            physics=f"The error's standard deviation is another {region.text}.",
+            physics=f"The error's standard deviation differs {region.text}.",
             source="s exp(c w(x)).",
             requires=("x",),
         )
@@ -119,7 +119,7 @@ def _apart(found: Sequence[Region]) -> list[Region]:
 
 def stale_map(sites: Sites, data: Data) -> list[Effect]:
     """The map behind the predictor is old: whole districts of it are off, each by an amount of its own."""
-    if not offers(sites, "predicted_label"):
+    if not _offers(sites, data, "predicted_label"):
         return []
     field = _districts(np.asarray(data["x"], float)[:, :2])
     if field is None:
@@ -141,6 +141,11 @@ def stale_map(sites: Sites, data: Data) -> list[Effect]:
             field_shape=lambda *_: (1, min(_POINTS, len(data["x"]))),
         )
     ]
+
+
+def _offers(sites: Sites, data: Data, name: str) -> bool:
+    """Whether the model computes this site, from predictions and features of the data."""
+    return offers(sites, name) and data.get("x") is not None and data.get("prediction") is not None
 
 
 def _districts(

@@ -52,10 +52,10 @@ def gain_offset(sites: Sites, data: Data) -> list[Effect]:
 def _ends(side: str, paths: PathSet) -> list[Effect]:
     """One for each place of a side that several links share, where there are several of these."""
     name, position = _END[side], np.round(np.asarray(getattr(paths, f"{side}_position"), float), 3)
-    places, first, count = np.unique(position, axis=0, return_index=True, return_counts=True)
+    places, count = np.unique(position, axis=0, return_counts=True)
     if not 2 <= len(places) <= _MOST_ENDS or count.min() < 2:
         return []
-    return [_of_end(side, f"{name}_{k}", place) for k, place in enumerate(places[np.argsort(first)])]
+    return [_of_end(side, f"{name}_{k}", place) for k, place in enumerate(places)]
 
 
 def _of_end(side: str, instance: str, place: np.ndarray) -> Effect:

@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.common import (
-    CHANNEL_AXES,
     SIDES,
     Data,
     Family,
@@ -27,6 +26,7 @@ from dtprob.effects.common import (
 )
 from dtprob.effects.distributions import ComplexStudentT, replace_base
 from dtprob.effects.effect import FIELD, Effect, Rewrite
+from dtprob.effects.meaning import CHANNEL_AXES
 
 _PARTS: Final = 8
 """Bands, or stretches of time, in which interference is looked for."""

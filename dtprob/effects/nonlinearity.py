@@ -9,7 +9,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.common import (
-    CHANNEL_AXES,
     Data,
     Family,
     Sites,
@@ -24,6 +23,7 @@ from dtprob.effects.common import (
     square,
 )
 from dtprob.effects.effect import Effect
+from dtprob.effects.meaning import CHANNEL_AXES
 
 _SALEH: Final = (
     "A. Saleh, IEEE Trans. Commun. 29 (1981); to first order the cubic term of a memoryless polynomial."
@@ -93,8 +93,10 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
             source="h + g sqrt(P), g complex (real, imaginary).",
         )
     ]
+    if measured is None:
+        return effects
     frequency = np.asarray(data["subcarrier_frequency"], dtype=float)
-    if measured is None or np.abs(frequency).min() > 0.25 * measured.width / (measured.size - 1):
+    if np.abs(frequency).min() > 0.25 * measured.width / (measured.size - 1):
         return effects
 
     def offset(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:

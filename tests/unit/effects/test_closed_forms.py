@@ -328,6 +328,18 @@ def test_coupling_of_neighbours_on_a_line(apply):
     assert np.allclose(found, before @ matrix.T)
 
 
+def test_elements_at_one_place_couple_too(build_world):
+    """As the two polarisations of an antenna do."""
+    world = build_world(tx_array=np.zeros((2, 3)), rx_array=np.zeros((4, 3)))
+    pair, four = catalogue(world.sites, world.data, "mutual_coupling")[::-1]
+    assert [e.parameters[0].shape for e in (pair, four)] == [(2,), (2,)]
+    context = Context(world.data, {})
+    moved = pair.rewrites["tx_response"](
+        jnp.array([[1.0 + 0j, 2.0]]), {"coupling": jnp.array([0.1, 0.0])}, context
+    )
+    np.testing.assert_allclose(moved, [[1.2, 2.1]])
+
+
 def test_calibration_and_cable_of_one_element(world, apply):
     before = apply()
     found = apply("array_calibration[rx_2]", log_gain=0.3, phase=-0.4)["rx_response"]

@@ -38,3 +38,12 @@ def test_other_links_of_the_same_transmitter_count_too(world):
 
 def test_no_gain_of_an_only_transmitter(world):
     assert set(effects(world, [0, 0, 0], [0, 1, 2])[0]) == {None}
+
+
+def test_devices_are_counted_by_their_places_as_elsewhere(world):
+    found, data = effects(
+        world, [1, 1, 0, 0, 1], [0, 1, 2, 0, 2]
+    )  # the first link is of the device farther along x
+    value = jnp.ones((5, 4), complex)
+    moved = found["transmitter_0"].rewrites["path_gain"](value, {"log_gain": 0.5}, Context(data, {}))
+    np.testing.assert_allclose(moved[:, 0], np.exp(0.5 * np.array([0, 0, 1, 1, 0])))

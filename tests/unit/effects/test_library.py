@@ -1,12 +1,14 @@
 """Which effects are offered for which model and data, and how they are chosen."""
 
+import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
 
 from dtprob.effects import FAMILIES, Effect, Parameter, catalogue, summaries
 from dtprob.errors import InputError
-from dtprob.models.declaration import Site, declare
+from dtprob.models.declaration import Site, declare, model
 
 USER = Effect(
     "mine", {"path_gain": lambda value, p, _: value * (1 + p["a"])}, (Parameter("a", dist.Normal()),)
@@ -57,6 +59,24 @@ def test_two_antennas_are_calibrated_once(build_world, world):
     pair = build_world(tx_array=world.data["tx_array"][:2])
     names = [e.name for e in catalogue(pair.sites, pair.data, ["array_calibration", "cable_delay"])]
     assert [name for name in names if "tx" in name] == ["array_calibration[tx]", "cable_delay[tx_1]"]
+
+
+@numpyro.handlers.seed(rng_seed=0)
+def _in_decibels(paths=None):
+    numpyro.deterministic("path_gain", jnp.zeros((4, 5)))
+    numpyro.deterministic("predicted_label", jnp.zeros(4))
+    numpyro.deterministic("noiseless_channel", jnp.zeros((4, 5), complex))
+    numpyro.sample("y", dist.Normal(jnp.zeros(4), 1.0), obs=jnp.zeros(4))
+
+
+@pytest.mark.parametrize(
+    "axes", [{"path_gain": ("link", "reading")}, {"path_gain": ("link", "path")}], ids=["readings", "real"]
+)
+def test_sites_that_mean_something_else_by_the_same_name_are_left_alone(axes):
+    """A gain in dB of readings is no amplitude of paths; labels without predictions and features are no labels."""
+    axes |= {"predicted_label": ("sample",)}
+    declared = declare(model(axes=axes)(_in_decibels), {})
+    assert catalogue(declared.sites, {"channel": np.ones((4, 5), complex)}) == ()
 
 
 def test_one_subcarrier_has_no_band(build_world, world):
