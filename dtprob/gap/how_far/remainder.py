@@ -17,6 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.determined import shared_weights
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.calibration import Calibration, calibration
 from dtprob.gap.how_far.closed import ClosedFraction, Fold, HeldOut
@@ -99,7 +100,7 @@ def model_remainder(
     parts = list(closed.fold_fits(wider, full, np.sum([i * f.held for i, f in enumerate(folds)], axis=0)))
     after = closed.judged(wider, parts)
     reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
-    size = sum(_determined(wider, full, n) for n in taken)
+    size = sum(shared_weights(wider, full, n) for n in taken)
     cost = closed.cost(size, len(parts))
     floor = closed.Floor(reached, max(best - cost, reached), size, cost)
     return Remainder(
@@ -200,13 +201,6 @@ def _term(problem: Problem, suspect: Suspect) -> Term:
         is_per_cluster(problem, suspect),
         suspect.evidence,
     )
-
-
-def _determined(problem: Problem, fitted: fitting.Fit, name: str) -> float:
-    """Number of shared weights that the data determine."""
-    place = {int(i): j for j, i in enumerate(fitted.global_index)}
-    index = [place[int(i)] for b in problem.blocks_of(name) if not b.local for i in b.index[0]]
-    return float(np.sum(1 - np.diag(fitted.covariance)[index] / fitted.spread[name] ** 2))
 
 
 def _is_positive(value: jax.Array) -> bool:

@@ -9,12 +9,13 @@ from typing import Any
 import jax
 import numpy as np
 
-from dtprob.effects.effect import Effect, Parameter
+from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.rewriting import with_effects
 from dtprob.gap.diagnosis import Size
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.determined import deviation_of_spread
 from dtprob.gap.fitting.informed import informed
-from dtprob.gap.fitting.plausible import nulls, scales, sides, sizes
+from dtprob.gap.fitting.plausible import nulls, plausible_spread, scales, sides
 from dtprob.gap.model.problem import Problem
 from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.inference.laplace import Laplace
@@ -34,7 +35,7 @@ def confirm(
     means = [e for e in effects if e.kind == "mean"]
     found: list[Size] = []
     if means:
-        posterior = _posterior(problem, fitted, means, key, engine)
+        posterior = _posterior(problem, fitted, effects, key, engine)
         for effect in means:
             for parameter in effect.parameters:
                 draws = posterior[effect.site_name(parameter.name)]
@@ -48,12 +49,13 @@ def confirm(
 
 
 def _posterior(
-    problem: Problem, fitted: fitting.Fit, means: Sequence[Effect], key: jax.Array, engine: AbstractEngine
+    problem: Problem, fitted: fitting.Fit, effects: Sequence[Effect], key: jax.Array, engine: AbstractEngine
 ) -> dict[str, np.ndarray]:
-    """Draws of the effects' parameters by site: of the engine, or of the refit's own normal approximation.
+    """Draws of the parameters of mean effects by site, of the engine, or of the refit's own normal approximation.
 
     The refit is a mode with its curvature, so for `Laplace` there is nothing to run again.
     """
+    means = [e for e in effects if e.kind == "mean"]
     if isinstance(engine, Laplace):
         position = {int(i): j for j, i in enumerate(fitted.global_index)}
         noise = np.asarray(jax.random.normal(key, (engine.draws, len(fitted.global_index))))
@@ -61,10 +63,24 @@ def _posterior(
         moved = np.maximum(moved, _lowest(problem, means, fitted))
         names = [e.site_name(p.name) for e in means for p in e.parameters]
         return {n: moved[:, [position[int(i)] for i in problem.layout[n].index[0]]] for n in names}
-    started = _start_at(engine, problem.initial(fitted.x, means))
-    model = with_effects(informed(problem.model, problem.known), means)
+    fields = _fields_at(problem, fitted, effects)
+    started = _start_at(engine, {**problem.initial(fitted.x, means), **fields})
+    model = with_effects(informed(problem.model, problem.known), effects)
     posterior = started(key, model, problem.data, options=LATENTS_ONLY)
     return {name: np.asarray(draws) for name, draws in posterior.draws.items()}
+
+
+def _fields_at(problem: Problem, fitted: fitting.Fit, effects: Sequence[Effect]) -> dict[str, np.ndarray]:
+    """Where random fields start: entries of unit spread, their standard deviations, and their places."""
+    found: dict[str, np.ndarray] = {}
+    for effect in (e for e in effects if e.kind == "variance"):
+        spread, block = fitted.spread[effect.name], problem.field_of(effect)
+        found[effect.site_name(FIELD)] = np.asarray(problem.layout.part(fitted.x, block.name)) / spread
+        for parameter in effect.parameters:
+            name = effect.site_name(parameter.name)
+            at = problem.layout.part(fitted.x, name) if parameter.is_place else spread
+            found[name] = np.broadcast_to(at, parameter.shape)
+    return found
 
 
 def _lowest(problem: Problem, means: Sequence[Effect], fitted: fitting.Fit) -> np.ndarray:
@@ -122,7 +138,7 @@ def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) 
             deviation, lowest = float(np.sqrt(fitted.covariance[position[index], position[index]])), -np.inf
         else:
             middle = fitted.spread[effect.name]
-            deviation, lowest = middle / np.sqrt(2 * max(problem.field_of(effect).index.size, 1)), 0.0
+            deviation, lowest = deviation_of_spread(problem, fitted, effect.name), 0.0
         half, name = _Z90 * deviation, f"{prefix}{parameter.name}{_suffix(parameter.unit)}"
         found.append(Size(name, middle, max(middle - half, lowest), middle + half, parameter.unit))
     return found
@@ -130,6 +146,6 @@ def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) 
 
 def _plausible(effect: Effect, fitted: fitting.Fit, problem: Problem) -> bool:
     if effect.kind == "variance":
-        return fitted.spread[effect.name] <= 4 * float(scales(effect)[sizes(effect)].max())
+        return fitted.spread[effect.name] <= 4 * plausible_spread(effect)
     index = problem.layout.of(effect)
     return bool(np.all(np.abs(fitted.x[index] - nulls(effect)) <= 4 * scales(effect)))

@@ -1,0 +1,70 @@
+"""How well a field's spread is known, against the exact posterior of a hierarchy of normals."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.determined import deviation_of_spread, shared_weights
+from dtprob.gap.fitting.fit import fit
+from dtprob.gap.model.problem import Problem
+from dtprob.models.declaration import model
+
+LINKS, READINGS, NOISE, SPREAD = 150, 3, 2.0, 1.0
+
+
+@model(axes={"expected": ("link", "reading")}, cluster="link")
+def levels(y=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    expected = numpyro.deterministic("expected", level * jnp.ones((LINKS, READINGS)))
+    with numpyro.plate("link", LINKS, dim=-2), numpyro.plate("reading", READINGS, dim=-1):
+        numpyro.sample("y", dist.Normal(expected, NOISE), obs=y)
+
+
+def effect(shape):
+    return Effect(
+        "shadowing",
+        {"expected": lambda value, p, _: value + p["scale"] * p[FIELD]},
+        (Parameter("scale", dist.HalfNormal(2.0), unit="dB"),),
+        kind="variance",
+        field_shape=lambda value, _: shape,
+    )
+
+
+def fitted(field, y):
+    problem = Problem(levels, {"y": jnp.asarray(y)}, [field])
+    base = fit_base(problem, jax.random.key(0))
+    wider = problem.with_live([field.name])
+    return wider, fit(wider, wider.translate(base.x, problem), [field.name])
+
+
+def exact_deviation(means, variance):
+    """Posterior standard deviation of the spread of normal means, each of this variance about its own, level unknown."""
+    s = np.linspace(1e-3, 4.0, 4000)
+    total = s**2 + variance
+    square = ((means - means.mean()) ** 2).sum()
+    log_p = -0.5 * (len(means) - 1) * np.log(total) - 0.5 * square / total
+    weight = np.exp(log_p - log_p.max())
+    weight /= weight.sum()
+    return float(np.sqrt(weight @ s**2 - (weight @ s) ** 2))
+
+
+@pytest.mark.parametrize(
+    ("shape", "axis"), [((LINKS, 1), 1), ((1, READINGS), 0)], ids=["own of each link", "shared by links"]
+)
+def test_the_spread_is_known_as_its_exact_posterior_says(shape, axis):
+    rng = np.random.default_rng(1)
+    spread = SPREAD if axis else 30.0  # of three entries only a spread far above the noise is known at all
+    y = -60 + spread * rng.normal(size=shape) + NOISE * rng.normal(size=(LINKS, READINGS))
+    problem, found = fitted(effect(shape), y)
+    told = deviation_of_spread(problem, found, "shadowing")
+    if axis:
+        assert told == pytest.approx(exact_deviation(y.mean(axis=1), NOISE**2 / READINGS), rel=0.05)
+        assert shared_weights(problem, found, "shadowing") == 0.0
+    else:
+        assert told == pytest.approx(found.spread["shadowing"] / np.sqrt(2 * READINGS), rel=0.35)
+        assert shared_weights(problem, found, "shadowing") == pytest.approx(READINGS, abs=1.1)
