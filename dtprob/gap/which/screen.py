@@ -25,6 +25,7 @@ from dtprob.gap.fitting.soundness import UNSEEN
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import LOG_SMALLEST, deviation, family_wise, log_gamma_tail, normal_quantile
+from dtprob.gap.which.detectable import Detectable, detectable
 from dtprob.gap.which.directions import Tangents, surroundings, tangents
 from dtprob.gap.which.fields import field_tests
 from dtprob.gap.which.pairs import Pair, best_pairs
@@ -49,7 +50,7 @@ class Screening:
         log_bayes_factor: of adding the candidate, from (u, J) and its prior.
         step: one-step estimate of each mean effect's parameters, flat.
         absorbed_by: the nuisance that hides the candidate, if one does.
-        detectable: size along the best-determined direction that would be noticed nine times in ten.
+        detectable: from which size on each would be noticed nine times in ten; None of random fields and where none is.
         correlation: of the candidates' scores after adjustment; aliases are near +-1.
         locates: whether a candidate says how the expected observations move, not only how they spread.
         replicate_p: smallest p-value over all candidates in each bootstrap replicate.
@@ -63,11 +64,15 @@ class Screening:
     log_bayes_factor: np.ndarray
     step: dict[str, np.ndarray]
     absorbed_by: tuple[str | None, ...]
-    detectable: np.ndarray
+    detectable: tuple[Detectable | None, ...]
     correlation: np.ndarray
     locates: tuple[bool, ...]
     replicate_p: np.ndarray
     scores: Scores
+
+    def promise_of(self, name: str) -> float:
+        """Nats that a candidate promises to gain, to first order and less what its prior costs."""
+        return float(self.log_bayes_factor[self.names.index(name)])
 
     def shows_gap(self, settings: Settings) -> bool:
         """Whether the scores show a gap at their half of the level."""
@@ -135,7 +140,7 @@ def screen(
         log_bayes_factor=log_bf[order],
         step={e.name: scores.step(k) for k, e in enumerate(means)},
         absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),
-        detectable=np.array([_detectable(scores, c, settings) for c in candidates]),
+        detectable=tuple(_detectable(scores, c, settings) for c in candidates),
         correlation=_correlation(candidates, scores),
         locates=tuple(c.name in scores.locating for c in candidates),
         replicate_p=replicate_p,
@@ -288,15 +293,14 @@ def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Eff
     return blocks[int(owners[int(np.argmax(share))])].name
 
 
-def _detectable(scores: Scores, effect: Effect, settings: Settings) -> float:
+def _detectable(scores: Scores, effect: Effect, settings: Settings) -> Detectable | None:
+    """From which size on a candidate would be noticed, if it moves an expectation or has another size to tell of."""
     if effect.kind != "mean":
-        return float("nan")
+        return None
     k = [e.name for e in scores.effects].index(effect.name)
-    first = scores.groups[k][0]
-    own = float(scores.information[first, first])
-    level = settings.level / (4 * max(len(scores.effects), 1) * np.exp(scores.price[k]))
-    needed = stats.norm.isf(level) + stats.norm.isf(0.1)
-    return float(needed / np.sqrt(own)) if own > _NOTHING * scores.total[first] else float("inf")
+    own, total = np.diag(scores.part(k)), scores.total[scores.groups[k]]
+    level = settings.level / (2 * max(len(scores.effects), 1) * float(np.exp(scores.price[k])))
+    return detectable(effect, np.where(own > _NOTHING * total, own, 0.0), scores.root(k).shape[1], level)
 
 
 def _correlation(candidates: list[Effect], scores: Scores) -> np.ndarray:
