@@ -39,7 +39,11 @@ def _bounded_score(score: NormalScore, p: Parameters, bound: jax.Array) -> jax.A
 
 
 def censored(base: Likelihood, family: str, *, left: bool) -> Likelihood:
-    """Values of which those beyond a "limit" are only known to be there; "censored" is 1 of the data that are."""
+    """Values of which those beyond a "limit" are only known to be there; "censored" is 1 of the data that are.
+
+    What a reading tells on average is that of one with the "farthest" limit of all, whatever became of it: limits of
+    readings that were not censored are not known, and scores whitened by their outcome would have no mean of zero.
+    """
     score = NORMAL_SCORES[family]
 
     def parts(p: Parameters) -> tuple[jax.Array, Any, Any]:
@@ -56,7 +60,7 @@ def censored(base: Likelihood, family: str, *, left: bool) -> Likelihood:
         return jnp.where(beyond, parts(p)[1][1], base.residual(own_of(base, p), inside))
 
     def information(p: Parameters) -> jax.Array:
-        chance, (_, mean, _), (_, _, second) = parts(p)
+        chance, (_, mean, _), (_, _, second) = parts({**p, "limit": p["farthest"]})
         chance = chance[..., None, None]
         return (1 - chance) * second + chance * outer(mean, mean)
 
@@ -65,7 +69,8 @@ def censored(base: Likelihood, family: str, *, left: bool) -> Likelihood:
         return (1 - chance) * within[0] + jnp.where(chance > 0, chance * p["limit"], 0.0)
 
     kind = _Floored if left else _Capped
-    made = made_of(base, lambda **p: kind(base.make(**own_of(base, p)), p), {"limit": 0, "censored": 0}, mean)
+    further = {"limit": 0, "farthest": 0, "censored": 0}
+    made = made_of(base, lambda **p: kind(base.make(**own_of(base, p)), p), further, mean)
     return whitened(made, Scores(scores, information, shift_of(base)), base.relocate)
 
 

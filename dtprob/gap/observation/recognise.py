@@ -109,7 +109,7 @@ def _compound(fn: Any, value: Any) -> _Found | None:
     if isinstance(fn, (dist.LeftCensoredDistribution, dist.RightCensoredDistribution)):
         kind = "LeftCensored" if isinstance(fn, dist.LeftCensoredDistribution) else "RightCensored"
         censored = jnp.broadcast_to(fn.censored, jnp.shape(value))
-        return _of(kind, fn.base_dist, {"limit": _limits(kind, censored, value), "censored": censored})
+        return _of(kind, fn.base_dist, _limits(kind, censored, value))
     for kind, (made, bounds) in TRUNCATED.items():
         if type(fn) is made:
             return _of(kind, fn.base_dist, {n: getattr(fn, n) for n in bounds})
@@ -149,13 +149,19 @@ def _of(kind: str, base: Any, further: Mapping[str, Any]) -> _Found | None:
     return _Found(f"{kind} {found.family}", {**found.parameters, **further})
 
 
-def _limits(kind: str, censored: jax.Array, value: Any) -> jax.Array:
-    """Where each reading would have been censored.
+def _limits(kind: str, censored: jax.Array, value: Any) -> dict[str, jax.Array]:
+    """Where each reading would have been censored, and the farthest such limit of any, the same for all.
 
-    Those that were are at their limit; the others are taken to have had the farthest limit of any, if they are within it.
+    Those that were are at their limit; the others are taken to have had the farthest, if they are within it.
     """
     sign = 1.0 if kind == "LeftCensored" else -1.0
     own = sign * jnp.asarray(value, float)
-    censored = censored & jnp.isfinite(own)
-    farthest = jnp.where(censored, own, jnp.inf).min()
-    return sign * jnp.where(censored, own, jnp.where(own > farthest, farthest, -jnp.inf))
+    among = censored & jnp.isfinite(own)
+    farthest = jnp.where(among, own, jnp.inf).min()
+    limit = jnp.where(among, own, jnp.where(own > farthest, farthest, -jnp.inf))
+    known = jnp.where(jnp.isfinite(farthest), farthest, -jnp.inf)
+    return {
+        "limit": sign * limit,
+        "farthest": jnp.broadcast_to(sign * known, own.shape),
+        "censored": censored,
+    }

@@ -398,6 +398,17 @@ def test_a_reading_far_beyond_its_limit_stays_finite():
         assert np.all(np.isfinite(whiten.shift(observed, {**still, "loc": jnp.ones(2)})))
 
 
+def test_rows_have_no_mean_where_each_reading_has_a_floor_of_its_own():
+    """As each spreading factor has: whitened by what became of them, those beyond a high floor weighed too much."""
+    rng = np.random.default_rng(0)
+    level, floor = rng.normal(0.0, 1.0, COUNT), rng.choice([-2.0, -1.0, 0.0, 1.0], COUNT)
+    values = np.maximum(level + rng.standard_normal(COUNT), floor)
+    fn = dist.LeftCensoredDistribution(dist.Normal(jnp.asarray(level), 1.0), jnp.asarray(values == floor))
+    rows = np.asarray(whiten.residual(whiten.observation(fn, jnp.asarray(values), "y"), jnp.asarray(values)))
+    assert np.all(np.abs(rows.mean(1)) < 4 * rows.std(1) / np.sqrt(COUNT))
+    assert np.all((rows.var(1) > 0.6) & (rows.var(1) < 1.05))
+
+
 def test_limits_of_readings_that_were_not_censored():
     """The farthest limit of any; a reading beyond that had none."""
     values = jnp.array([-90.0, -100.0, -95.0, -101.0, -80.0])
