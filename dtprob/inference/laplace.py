@@ -23,6 +23,7 @@ from dtprob.inference.optimise import curvature, gradient_and_hessian
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
+from dtprob.models.supported import differentiated_forwards
 
 COUNTS = {"draws": 1, "starts": 1, "max_steps": 1}
 """The least that the settings can be."""
@@ -93,7 +94,8 @@ class Laplace(AbstractEngine):
             starts=self.starts,
             max_steps=self.max_steps,
         )
-        gaussian: Gaussian = target.compiled(approximate)(mode.optimum.position, inputs)
+        with differentiated_forwards():
+            gaussian: Gaussian = target.compiled(approximate)(mode.optimum.position, inputs)
         noise = jax.random.normal(draw_key, (self.draws, target.dimension))
         positions = gaussian.mode + noise @ gaussian.factor.T
         return assemble(

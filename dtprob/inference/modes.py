@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 from dtprob.errors import InputError
 from dtprob.inference.optimise import Optimum, best, minimise
 from dtprob.inference.target import Inputs, Target
+from dtprob.models.supported import differentiated_forwards
 
 type Objective = Literal["density", "map", "maximum_likelihood"]
 
@@ -80,12 +81,13 @@ def find_mode(
         max_steps: bound on the steps of each.
 
     Raises:
-        InputError: the density is not finite at any start.
+        InputError: the density is not finite at any start, or has derivatives backwards only.
     """
     values = target.latent_values(initial or {})
     count = 1 if len(values) == len(target.coordinates) else starts
     points = starting_points(target, inputs, key, objective=objective, values=values, starts=count)
-    mode: Mode = target.compiled(search, objective, max_steps)(points, inputs)
+    with differentiated_forwards():
+        mode: Mode = target.compiled(search, objective, max_steps)(points, inputs)
     if not bool(jnp.isfinite(mode.optimum.value)):
         what = f"model {target.declaration.name}"
         remedy = "Give initial values, or check that the data are finite and within the model's supports"

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Generator, Mapping
+from contextlib import contextmanager
 from typing import Any
 
 import equinox as eqx
@@ -12,6 +13,26 @@ from numpyro.distributions import biject_to, constraints
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, model_name, split_static
 from dtprob.models.declaration import base_constraint, trace_model
+
+
+@contextmanager
+def differentiated_forwards() -> Generator[None]:
+    """Say what to do where a function of a model has derivatives backwards only.
+
+    Raises:
+        InputError: one has.
+    """
+    try:
+        yield
+    except TypeError as error:
+        if "custom_vjp" not in str(error):
+            raise
+        raise InputError(
+            "model",
+            "functions that can be differentiated forwards, too",
+            "one with a custom_vjp, such as jax.experimental.ode.odeint",
+            "Integrate by Runge-Kutta steps in jax.lax.scan, or by diffrax with its DirectAdjoint",
+        ) from error
 
 
 def check_supported(model: Model, data: Data) -> None:

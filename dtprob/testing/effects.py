@@ -41,8 +41,8 @@ def check_effect(
     """
     key = jax.random.key(0) if key is None else key
     what = f"effect {effect.name}"
-    for name in ("family", "physics"):
-        expect(getattr(effect, name), what, f"a text for {name!r}", "none", "Say it in a line")
+    remedy = "Say in a line what it is: the report shows it beside the cause"
+    expect(effect.physics, what, "a text for 'physics'", "none", remedy)
     for parameter in effect.parameters:
         _check_parameter(f"{what}, parameter {parameter.name!r}", parameter, key)
     with numpyro.validation_enabled(False):  # values that are not finite are for the checks to find

@@ -15,6 +15,7 @@ from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
 from dtprob.models.axes import is_unnamed
 from dtprob.models.declaration import Declaration, declare, trace_model
+from dtprob.models.supported import differentiated_forwards
 from dtprob.testing.contract import expect, same
 
 _POINTS = 8
@@ -49,7 +50,7 @@ def check_model(model: Model, data: Mapping[str, Any], *, key: jax.Array | None 
 
 def _check_axes(what: str, declaration: Declaration) -> None:
     for name, site in declaration.sites.items():
-        unnamed = [axis for axis in site.axes if is_unnamed(axis)]
+        unnamed = [axis for axis, n in zip(site.axes, site.shape, strict=True) if is_unnamed(axis) and n > 1]
         remedy = f"Use plates, or the decorator @model(axes={{{name!r}: (...)}})"
         expect(not unnamed, what, f"a name for every axis of {name!r}", f"{len(unnamed)} without", remedy)
 
@@ -85,6 +86,8 @@ def _check_repeats(what: str, model: Model, data: Mapping[str, Any], key: jax.Ar
 
 def _check_density(what: str, target: Target, inputs: Inputs, key: jax.Array) -> None:
     points = target.compiled(Target.prior_draws)(key, inputs, {})[:_POINTS]
+    with differentiated_forwards():
+        target.compiled(_pushed)(points[0], inputs)
     function = target.compiled(_value_and_slope)
     direction = jax.random.normal(jax.random.fold_in(key, 1), (target.dimension,))
     direction /= jnp.linalg.norm(direction)
@@ -103,6 +106,10 @@ def _check_density(what: str, target: Target, inputs: Inputs, key: jax.Array) ->
     close = abs(numeric - float(slope)) <= 1e-3 * max(abs(numeric), abs(float(slope))) + rounding + 1e-6
     got = f"{float(slope):.6g} where differences give {numeric:.6g}"
     expect(close, what, "the gradient of the log density", got, "Look for a stopped gradient or a jump")
+
+
+def _pushed(target: Target, point: jax.Array, inputs: Inputs) -> jax.Array:
+    return jax.jvp(lambda x: target.log_density(x, inputs), (point,), (point,))[1]
 
 
 def _value_and_slope(

@@ -9,9 +9,12 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from jax.experimental.ode import odeint
 
 from dtprob.effects.effect import Effect, Parameter
+from dtprob.errors import InputError
 from dtprob.inference import AbstractEngine, Laplace
+from dtprob.inference.fit import fit
 from dtprob.models.declaration import model
 from dtprob.testing import ContractError, check_effect, check_engine, check_model
 
@@ -54,6 +57,33 @@ def fails_for_some(x, y=None):
     slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
     with numpyro.plate("row", x.shape[0]):
         numpyro.sample("y", dist.Normal(jnp.sqrt(slope) * x, 0.5), obs=y)
+
+
+def levels_of_nodes(x, y=None):
+    """A latent site in the outer of two plates, whose other axis has one entry."""
+    with numpyro.plate("node", x.shape[0], dim=-2):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("hour", x.shape[1], dim=-1):
+            numpyro.sample("y", dist.Normal(level + x, 0.5), obs=y)
+
+
+def battery(x, y=None):
+    """A differential equation whose derivatives go backwards only."""
+    rate = numpyro.sample("rate", dist.LogNormal(0.0, 0.3))
+    charge = odeint(lambda charge, _, r: -r * charge, 1.0, jnp.linspace(0.0, 1.0, x.shape[0]), rate)
+    with numpyro.plate("row", x.shape[0]):
+        numpyro.sample("y", dist.Normal(charge, 0.5), obs=y)
+
+
+def test_axes_of_one_entry_need_no_name():
+    check_model(levels_of_nodes, {"x": jnp.zeros((5, 4)), "y": jnp.ones((5, 4))})
+
+
+def test_what_cannot_be_differentiated_forwards_is_refused_with_a_remedy():
+    given = {"x": jnp.zeros(6), "y": jnp.ones(6)}
+    for ask in (check_model, lambda model, data: fit(model, data, engine="laplace", key=jax.random.key(0))):
+        with pytest.raises(InputError, match=r"odeint\. .*jax\.lax\.scan"):
+            ask(battery, given)
 
 
 @pytest.mark.parametrize(
