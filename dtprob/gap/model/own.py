@@ -1,7 +1,8 @@
 """Which unknowns of a model have an entry for each cluster, so that a fit can find and integrate them cluster by cluster.
 
-Where an axis of the model makes the clusters, its name tells. Where a column of the data does, as in `level[site]` with
-clusters by `site`, the model is asked: an entry belongs to a cluster if nothing else depends on it.
+Where an axis of the model makes the clusters, the plate of that name tells which entries may be; where a column of the
+data does, as in `level[site]` with clusters by `site`, any may. The model is asked in either case: an entry belongs to a
+cluster if nothing else depends on it, which is not so of independent draws that are made into a Gaussian process.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from dtprob.gap.model.quick import quick_jit
 from dtprob.models.declaration import Declaration
 
 if TYPE_CHECKING:
@@ -48,10 +50,18 @@ class Own(NamedTuple):
 
 def of_latents(problem: Problem) -> dict[str, Own]:
     """Which latent sites have entries for each cluster, asked of a problem in which none counts as having any."""
-    if problem.column is None:
-        shapes = {b.name: b.shape for b in problem.blocks_of(None)}
-        return along_axis(problem.declaration, shapes, problem.n_cluster)
-    return _moved_along_column(problem, problem.blocks_of(None))
+    blocks = problem.blocks_of(None)
+    if problem.column is not None:
+        return _moved_along_column(problem, blocks)
+    named = along_axis(problem.declaration, {b.name: b.shape for b in blocks}, problem.n_cluster)
+    if not named:
+        return {}
+    told, x = _densities(problem), problem.prior_draws(jax.random.key(0), 1)[0]
+    likelihood, prior = told(x)
+    if not np.isfinite([*likelihood, prior]).all():
+        return named
+    wide = {b.name: b.index.reshape(b.shape) for b in blocks if b.name in named}
+    return {n: own for n, own in named.items() if _belong(own.arranged(wide[n]), x, told)}
 
 
 def of_fields(problem: Problem) -> dict[str, Own]:
@@ -67,20 +77,27 @@ def _moved_along_column(problem: Problem, blocks: Iterable[Block]) -> dict[str, 
     wide = {b.name: b.index.reshape(b.shape) for b in blocks if problem.n_cluster in b.shape}
     if not wide:
         return {}
-
-    def told(x: np.ndarray) -> tuple[np.ndarray, float]:
-        likelihood, prior, _ = problem.compiled.evaluate(x)
-        return likelihood, float(prior)
-
+    told = _densities(problem)
     column = np.asarray(problem.data[str(problem.column)])
     return along_column(wide, column, problem.prior_draws(jax.random.key(0), 1)[0], told)
+
+
+def _densities(problem: Problem) -> LogDensities:
+    terms, arrays = quick_jit(problem.compiled.terms), problem.compiled.arrays
+
+    def told(x: np.ndarray) -> tuple[np.ndarray, float]:
+        found = terms(x, arrays)
+        return np.asarray(found.likelihood), float(found.prior)
+
+    return told
 
 
 def along_axis(
     declaration: Declaration, shapes: Mapping[str, tuple[int, ...]], n_cluster: int
 ) -> dict[str, Own]:
-    """Unknowns with the axis of the clusters, by the unconstrained shape of each."""
-    axes = {n: site.axes for n, site in declaration.latent.items() if len(site.axes) == len(shapes[n])}
+    """Unknowns in the plate of the clusters, by the unconstrained shape of each."""
+    inside = {n: site for n, site in declaration.latent.items() if declaration.cluster in site.plates}
+    axes = {n: site.axes for n, site in inside.items() if len(site.axes) == len(shapes[n])}
     found = {n: names.index(declaration.cluster) for n, names in axes.items() if declaration.cluster in names}
     return {n: Own(i, np.arange(n_cluster)) for n, i in found.items() if shapes[n][i] == n_cluster}
 

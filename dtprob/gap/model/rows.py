@@ -116,6 +116,13 @@ def _cluster_of(
 ) -> np.ndarray:
     if labels is not None:
         matching = [i for i, n in enumerate(site.shape) if n == len(labels)]
+        if len(matching) > 1:
+            raise InputError(
+                "cluster",
+                f"a column as long as one axis of {site.name!r}",
+                f"{column!r}, as long as {' and '.join(site.axes[i] for i in matching)}",
+                "Name one of these axes, or give the column another length",
+            )
         if matching:
             return labels[grid[matching[0]]]
     elif declaration.cluster in site.axes:
