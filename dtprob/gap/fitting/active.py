@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
-from typing import Final
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -13,12 +13,13 @@ import numpy as np
 import numpyro.distributions as dist
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import scales, sizes
+from dtprob.gap.fitting.plausible import plausible_spread
 from dtprob.gap.model.layout import Block
 from dtprob.gap.model.problem import Problem
 
 LOG_2PI: Final = float(np.log(2 * np.pi))
-_FAINT: Final = 0.1
+_FIRST: Final = 0.3
+"""Share of the largest plausible standard deviation of a field that its fit starts from."""
 
 
 @dataclass(frozen=True)
@@ -67,7 +68,10 @@ def activate(
     weights = np.ones(problem.n_cluster) if weights is None else weights
     fields = [e for e in chosen if e.kind == "variance"]
     return Active(
-        tuple(blocks), chosen, weights, {e.name: spread.get(e.name, _first_spread(e)) for e in fields}
+        tuple(blocks),
+        chosen,
+        weights,
+        {e.name: spread.get(e.name, _FIRST * plausible_spread(e)) for e in fields},
     )
 
 
@@ -76,20 +80,19 @@ def means_among(problem: Problem, names: Collection[str]) -> list[str]:
     return [e.name for e in problem.live if e.name in names and e.kind == "mean"]
 
 
-def _first_spread(effect: Effect) -> float:
-    """A tenth: in the field's own unit or, where that is more, of its largest plausible standard deviation."""
-    return _FAINT * max(1.0, float(scales(effect)[sizes(effect)].max()))
-
-
 def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Log prior, its gradient and minus its curvature (diagonal) for the free effects' coordinates."""
+    """Log prior, its gradient and minus its curvature (diagonal) for the free effects' coordinates.
+
+    Of a field of which clusters have their own entries, those of clusters that are left out do not count in the first.
+    """
     total = 0.0
     gradient, curvature = np.zeros(problem.dimension), np.zeros(problem.dimension)
     for effect in active.effects:
         if effect.kind == "variance":
             sd, block = active.spread[effect.name], problem.field_of(effect)
             w = x[block.index]
-            total += float(-0.5 * np.sum(w**2) / sd**2 - w.size * (np.log(sd) + 0.5 * LOG_2PI))
+            density = -0.5 * np.sum((w / sd) ** 2, axis=1) - w.shape[1] * (np.log(sd) + 0.5 * LOG_2PI)
+            total += float(density @ (active.weights if block.local else np.ones(1)))
             gradient[block.index] = -w / sd**2
             curvature[block.index] = 1 / sd**2
         for parameter in effect.fitted:
@@ -107,14 +110,20 @@ def effect_prior(problem: Problem, active: Active, x: np.ndarray) -> tuple[float
 
 @jax.jit
 def _log_prob(prior: dist.Distribution, value: np.ndarray) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Of all entries together, its slope, and minus its curvature along each; one program for each kind of distribution."""
+    """Of all entries together, its slope, and minus its curvature along each; one program for each kind of distribution.
+
+    Minus infinity where the prior does not allow a value, which its density does not tell.
+    """
 
     def total(flat: jax.Array) -> jax.Array:
         return jnp.sum(prior.log_prob(flat.reshape(value.shape)))
 
     flat = jnp.asarray(value, float).reshape(-1)
     slope = jax.grad(total)
-    return total(flat), slope(flat), -jnp.diagonal(jax.jacfwd(slope)(flat))
+    support: Any = prior.support
+    is_allowed = jnp.all(support(flat.reshape(value.shape)))
+    density = jnp.where(is_allowed, total(flat), -jnp.inf)
+    return density, slope(flat), -jnp.diagonal(jax.jacfwd(slope)(flat))
 
 
 def basis(problem: Problem, active: Active) -> np.ndarray:

@@ -65,5 +65,8 @@ class Centred(NamedTuple):
 
 
 def per_unit(own: np.ndarray) -> np.ndarray:
-    """W (W' W)^-1 of tangents W (cluster, row, own); what moves nothing is left out."""
-    return own @ np.linalg.pinv(np.swapaxes(own, 1, 2) @ own, hermitian=True)
+    """W (W' W)^-1 of tangents W (cluster, row, own), whatever their units; what moves nothing is left out."""
+    size = np.sqrt((own**2).sum(axis=1, keepdims=True))
+    size = np.where(size > 0, size, 1.0)
+    unit = own / size
+    return unit @ np.linalg.pinv(np.swapaxes(unit, 1, 2) @ unit, hermitian=True) / size

@@ -48,8 +48,17 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
 def _prior_at(
     problem: Problem, active: Active, x: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Slope of all priors and of the volume; the base model's curvature along directions; that of effects' priors."""
+    """Slope of all priors and of the volume; the base model's curvature along directions; that of effects' priors.
+
+    What clusters share does not see the priors of unknowns of clusters that are left out; these follow their own cluster.
+    """
     gradient, hessian = problem.compiled.prior(x, directions)
+    if active.local_index.size and (active.weights != 1).any():
+        shared = active.global_index
+        weighted, curvature = problem.compiled.prior(x, directions, active.weights)
+        gradient, hessian = gradient.copy(), hessian.copy()
+        gradient[shared] = weighted[shared]
+        hessian[: len(shared), shared] = curvature[: len(shared), shared]
     _, effect_gradient, effect_curvature = effect_prior(problem, active, x)
     gradient = gradient + effect_gradient
     if problem.volume is not None and len(active.global_index):

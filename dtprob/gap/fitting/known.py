@@ -17,7 +17,7 @@ _FAINT: Final = 1e-3
 _HEAVY: Final = ("StudentT", "Cauchy", "Laplace", "Logistic", "SoftLaplace")
 """Priors with heavier tails than a normal one, drawn about zero."""
 _LEVEL: Final = 1e-6
-"""Slope of a log prior that is none."""
+"""Slope of a log prior that is none, and distance from zero, in units of the prior's spread."""
 _ALIKE: Final = 0.25
 """Share by which the centre and the spread of a normal distribution differ from those of its draws, at most."""
 _NEAR: Final = 0.5
@@ -85,7 +85,7 @@ def _skewed(
     known = {name for names in problem.known for name in names}
     base = [b for b in active.blocks if b.owner is None and b.name not in known and not _is_heavy(problem, b)]
     at = np.unique(np.concatenate([b.index.reshape(-1) for b in base])) if base else np.zeros(0, int)
-    at = at[alone[at] & (np.abs(slope[at]) > _LEVEL)]
+    at = at[alone[at] & (np.abs(slope[at]) * problem.prior_middle[1][at] > _LEVEL)]
     at = at[np.abs(curvature[at]) > _FAINT * told[at]]
     middle, spread = (part[at] for part in problem.prior_middle)
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -133,8 +133,9 @@ def _heavy_tailed(
     index = np.unique(np.concatenate([i.reshape(-1) for i in own]))
     centre = x.copy()
     centre[index] = 0.0
-    level = np.abs(problem.compiled.prior(centre, directions)[0][index]) < _LEVEL
-    away = level & (np.abs(x[index]) > _LEVEL)
+    spread = problem.prior_middle[1][index]
+    level = np.abs(problem.compiled.prior(centre, directions)[0][index]) * spread < _LEVEL
+    away = level & (np.abs(x[index]) > _LEVEL * spread)
     found[index[away]] = -slope[index[away]] / x[index[away]]
     return found
 

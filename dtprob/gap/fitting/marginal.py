@@ -15,6 +15,8 @@ from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
 
 _ROUNDS: Final = 4
+_DAMPING: Final = 1e-3
+"""Of a cluster's first step, as a share of its curvatures."""
 _GAIN: Final = 0.1
 """Nats by which a fit has to be better to be another one."""
 
@@ -68,16 +70,16 @@ def own_mode(
         steps: at most so many Gauss-Newton steps.
         tolerance: stop when the gain that a step promises, in nats per cluster, falls below.
     """
-    x, terms, damping = x.copy(), cluster_terms(problem, active, x), np.float64(1e-3)
+    x, terms, damping = x.copy(), cluster_terms(problem, active, x), np.full(problem.n_cluster, _DAMPING)
     own = active.own
     for _ in range(steps):
-        step = local_step(system_at(problem, own, x), float(damping))
+        step = local_step(system_at(problem, own, x), damping)
         trial = moved(own, x, step)
         new = cluster_terms(problem, active, trial)
         better = new > terms
         x[active.local_index[better]] = trial[active.local_index[better]]
         terms = np.where(better, new, terms)
-        damping = damping / 4 if better.all() else damping * 4
+        damping = np.where(better, damping / 4, damping * 4)
         if step.gain < tolerance * problem.n_cluster:
             break
     return x, positive(system_at(problem, own, x).local)

@@ -79,8 +79,8 @@ def _is_positive(scaled: np.ndarray) -> bool:
     return bool(np.einsum("...ii->...i", factor).min() > _SAFE)
 
 
-def local_step(system: System, damping: float) -> NewtonStep:
-    """The step of the local coordinates, the global ones held."""
+def local_step(system: System, damping: Float[np.ndarray, " cluster"]) -> NewtonStep:
+    """The step of the local coordinates, the global ones held; each cluster has a damping of its own."""
     _, alone = _alone(system, damping)
     gain = float((system.weights[:, None] * system.local_gradient * alone).sum()) / 2
     return NewtonStep(np.zeros(len(system.gradient)), alone, gain)
@@ -95,8 +95,8 @@ def newton_step(system: System, damping: float, lowest: Float[np.ndarray, " glob
         lowest: the smallest step that each global coordinate may make.
     """
     if not len(system.gradient):
-        return local_step(system, damping)
-    local, alone = _alone(system, damping)
+        return local_step(system, np.full(len(system.weights), damping))
+    local, alone = _alone(system, np.full(len(system.weights), damping))
     weights, schur, gradient = system.weights, system.curvature, system.gradient
     answer = np.zeros((len(weights), local.shape[-1], len(gradient)))
     if local.shape[-1]:
@@ -110,12 +110,13 @@ def newton_step(system: System, damping: float, lowest: Float[np.ndarray, " glob
     return NewtonStep(shared, moved, float(system.gradient @ shared + own) / 2)
 
 
-def _alone(system: System, damping: float) -> tuple[np.ndarray, np.ndarray]:
+def _alone(system: System, damping: Float[np.ndarray, " cluster"]) -> tuple[np.ndarray, np.ndarray]:
     """Damped curvature of the local coordinates, and their step with the global ones held."""
     local = positive(system.local)
     if not local.shape[-1]:
         return local, system.local_gradient
-    local = local + damping * np.einsum("cii->ci", local)[:, :, None] * np.eye(local.shape[-1])
+    diagonal = np.einsum("cii->ci", local)[:, :, None] * np.eye(local.shape[-1])
+    local = local + damping[:, None, None] * diagonal
     return local, np.linalg.solve(local, system.local_gradient[..., None])[..., 0]
 
 

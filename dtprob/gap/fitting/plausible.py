@@ -129,6 +129,11 @@ def sizes(effect: Effect) -> Int[np.ndarray, " size"]:
     return np.flatnonzero(~places(effect))
 
 
+def plausible_spread(effect: Effect) -> float:
+    """The largest plausible standard deviation of a random field's entries, in the unit of the effect."""
+    return float(scales(effect)[sizes(effect)].max())
+
+
 def is_one_sided(effect: Effect) -> bool:
     """Whether an effect has a single size, which cannot be below its null, and else only places."""
     index = sizes(effect)

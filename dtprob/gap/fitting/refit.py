@@ -11,7 +11,7 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import local_maxima, polish
 from dtprob.gap.fitting.marginal import settled
 from dtprob.gap.fitting.marginal_mode import faithful
-from dtprob.gap.fitting.plausible import LARGE, places, scales, sides
+from dtprob.gap.fitting.plausible import LARGE, places, plausible_spread, scales, sides
 from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -24,6 +24,8 @@ _SWEPT = 3
 """Parameters of an effect whose large sizes are tried with the clusters' angles found anew."""
 _SAME = 1.0
 """Nats by which a peak has to be higher than a start that the same hill leads from."""
+_VANISHED = 1e-3
+"""Share of its largest plausible spread below which a field has vanished; from a larger start it may not."""
 _REACH = 0.4
 """Share of the best trial's gain in log evidence from which on another may still overtake it."""
 
@@ -41,6 +43,9 @@ def refit(problem: Problem, fitted: fitting.Fit, effect: Effect, starts: Sequenc
     if effect.kind == "variance":
         index = problem.field_of(effect).index
         fits = [fitting.fit(problem, _at_null(problem, fitted.x, [effect.name]), names)]
+        if fits[0].spread[effect.name] < _VANISHED * plausible_spread(effect):
+            wide = {**fitted.spread, effect.name: plausible_spread(effect)}
+            fits.append(fitting.fit(problem, _at_null(problem, fitted.x, [effect.name]), names, spread=wide))
         for x in starts:
             spread = {**fitted.spread, effect.name: float(np.sqrt(np.mean(x[index] ** 2)))}
             fits.append(fitting.fit(problem, x, names, spread=spread))

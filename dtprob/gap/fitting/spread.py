@@ -10,9 +10,12 @@ import numpy as np
 
 from dtprob.gap.fitting.active import Active
 from dtprob.gap.fitting.newton import System, positive
+from dtprob.gap.fitting.plausible import plausible_spread
 from dtprob.gap.model.problem import Problem
 
-_FEWEST, _FAINTEST = 0.5, 1e-9
+_FEWEST: Final = 0.5
+_FAINTEST: Final = 1e-9
+"""Least standard deviation of a field, as a share of the largest plausible one."""
 _LONGEST: Final = float(np.log(3.0))
 
 type Changes = Mapping[str, float]
@@ -42,7 +45,8 @@ def respread(
         step = float(np.log(np.sqrt(np.sum(x[index] ** 2) / determined) / sd + 1e-300))
         shrink = step / latest[name] if latest.get(name) else 0.0
         step = step / (1 - shrink) if 0 < shrink < 1 else step
-        spread[name] = max(sd * float(np.exp(np.clip(step, -_LONGEST, _LONGEST))), _FAINTEST)
+        least = _FAINTEST * plausible_spread(effect)
+        spread[name] = max(sd * float(np.exp(np.clip(step, -_LONGEST, _LONGEST))), least)
         changes[name] = float(np.log(spread[name] / sd))
     change = max(abs(c) for c in changes.values())
     return replace(active, spread=spread), change, {} if latest else changes

@@ -260,16 +260,22 @@ class Compiled:
         return self._state(x).misses
 
     @cached_property
-    def prior(self) -> Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]:
-        """(x, basis (k, dimension)) -> gradient of the log prior of the base latents, minus its Hessian times the basis."""
+    def prior(self) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
+        """(x, basis (k, dimension)) -> gradient of the log prior of the base latents, minus its Hessian times the basis.
+
+        A third argument weights the priors of what clusters own (cluster,); all count fully by default.
+        """
 
         @quick_jit
-        def prior(x: Any, basis: jax.Array, arrays: Any) -> tuple[jax.Array, jax.Array]:
-            slope, push = jax.linearize(lambda y: jax.grad(self._runner.log_prior)(y, arrays), x)
+        def prior(x: Any, basis: jax.Array, weights: Any, arrays: Any) -> tuple[jax.Array, jax.Array]:
+            slope, push = jax.linearize(lambda y: jax.grad(self._runner.log_prior)(y, weights, arrays), x)
             return slope, -jax.vmap(push)(basis)
 
-        def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            parts = [prior(jnp.asarray(x), chunk, self.arrays) for chunk in _chunks(basis)]
+        def chunked(
+            x: np.ndarray, basis: np.ndarray, weights: np.ndarray | None = None
+        ) -> tuple[np.ndarray, np.ndarray]:
+            given = jnp.ones(self._runner.rows.n_cluster) if weights is None else jnp.asarray(weights, float)
+            parts = [prior(jnp.asarray(x), chunk, given, self.arrays) for chunk in _chunks(basis)]
             return np.asarray(parts[0][0]), np.concatenate([c for _, c in parts])[: len(basis)]
 
         return chunked

@@ -184,4 +184,4 @@ class Programs:
             effects: the candidates; those that may act anywhere do so where their null is now.
         """
         found = self._energy(dict(values), dict(gradients), self._nulls_of(effects), self._arrays)
-        return {name: np.asarray(value) for name, value in found.items()}
+        return {name: np.asarray(value, float) for name, value in found.items()}

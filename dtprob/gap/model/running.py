@@ -148,10 +148,10 @@ class Runner:
         """The observed distributions with given parameters."""
         return {n: whiten.Observation(f, dict(parameters[n])) for n, f in self.families.items()}
 
-    def log_prior(self, x: Any, arrays: Arrays) -> jax.Array:
-        """Log prior of the base latents."""
+    def log_prior(self, x: Any, weights: Any, arrays: Arrays) -> jax.Array:
+        """Log prior of the base latents, those that clusters own weighted (cluster,)."""
         found = self.run(x, arrays, {})
-        return found.prior + jnp.sum(found.local)
+        return found.prior + weights @ found.local
 
 
 def observations(declaration: Declaration, trace: Mapping[str, Any]) -> dict[str, whiten.Observation]:

@@ -38,7 +38,7 @@ class FieldTests(NamedTuple):
 def field_tests(
     energies: Mapping[str, Float[np.ndarray, "n weighting"]], names: Sequence[str], n: int
 ) -> FieldTests:
-    """Test variance effects.
+    """Test variance effects. One whose energies are not finite, as of a rewrite without a slope, tells nothing.
 
     Args:
         energies: weighted sums of squared scores, of the data and then of replicates.
@@ -47,7 +47,8 @@ def field_tests(
     """
     smallest, p_value, z, bayes, replicates = [], [], [], [], np.ones((n, len(names)))
     for k, name in enumerate(names):
-        observed, null = energies[name][0], energies[name][1:]
+        told = energies[name] if np.isfinite(energies[name]).all() else np.zeros_like(energies[name])
+        observed, null = told[0], told[1:]
         mean, variance = null.mean(axis=0), null.var(axis=0)
         p, quantile = gamma_tail(observed, mean, variance)
         null_p = gamma_tail(null, mean, variance)[0].min(axis=1)
