@@ -33,6 +33,8 @@ from dtprob.gap.where.moments import further_moments, moment
 from dtprob.gap.where.quantities import Quantity, groups, quantity
 from dtprob.gap.where.suspects import Suspect, suspects
 
+_ALL_SPREAD: Final = 0.999
+"""Share of what a site moves that lies in spreads where it moves nothing else."""
 _SURE: Final = 0.005
 """Probability below which a site is surely wrong."""
 _MORE: Final = 400
@@ -58,6 +60,7 @@ class SiteFinding:
         gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order; None
             where nothing that a model computes would move it.
         last: whether it may be the shadow of another: a wrong mean spreads too, and far strays look like wrong means.
+        spreads: whether moving the site moves nothing but spreads of observations.
     """
 
     site: str
@@ -65,6 +68,7 @@ class SiteFinding:
     p_value: float
     gain: float | None
     last: bool = False
+    spreads: bool = False
 
     @property
     def moment(self) -> str | None:
@@ -262,11 +266,17 @@ def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
 
 
 def _shadows_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
-    """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong."""
-    of_values = min((f.p_value for f in findings if f.moment is None), default=1.0)
-    of_moments = min((f.p_value for f in findings if f.moment is not None), default=1.0)
+    """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong.
+
+    A site that says how observations spread is one of their moments, by whatever name.
+    """
+    values = [f.moment is None and not f.spreads for f in findings]
+    of_values = min((f.p_value for f, one in zip(findings, values, strict=True) if one), default=1.0)
+    of_moments = min((f.p_value for f, one in zip(findings, values, strict=True) if not one), default=1.0)
     sure, by_noise = of_values <= _SURE, of_moments < of_values**2
-    return [replace(f, last=sure and (f.moment is None) == by_noise) for f in findings]
+    return [
+        replace(f, last=sure and is_value == by_noise) for f, is_value in zip(findings, values, strict=True)
+    ]
 
 
 def _rank(found: SiteFinding) -> tuple[bool, float, float]:
@@ -301,4 +311,7 @@ def _finding(
     gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)
     net = max(float(gain[0] - gain[1:].mean()), 0.0)
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
-    return SiteFinding(site.name, best.family.label, p_value, net)
+    spread_rows = problem.rows.by_cluster(problem.rows.located) == 0
+    moved = np.sum(shifts[0] ** 2)
+    spreads = bool(moved > 0 and np.sum(shifts[0][spread_rows] ** 2) > _ALL_SPREAD * moved)
+    return SiteFinding(site.name, best.family.label, p_value, net, spreads=spreads)

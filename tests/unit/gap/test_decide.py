@@ -12,7 +12,7 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.which.trials import Start, Trials, best, credit
 
 
-def evidence(kind, p_after):
+def evidence(kind, p_after, asked_for=()):
     """What `decide` looks at: one accepted effect of a kind, and the sites' p-value beside it."""
     view = SimpleNamespace(alarmed=lambda settings: True)
     return SimpleNamespace(
@@ -21,6 +21,7 @@ def evidence(kind, p_after):
         steps=[SimpleNamespace(view=view)],
         before=SimpleNamespace(site_p_value=1e-9),
         after=SimpleNamespace(site_p_value=p_after),
+        asked_for=asked_for,
     )
 
 
@@ -69,6 +70,12 @@ def test_a_random_field_too_large_for_what_it_is_that_leaves_something_is_an_imi
     kind, p_after, verdict
 ):
     assert decide(evidence(kind, p_after), (cause(0.99, plausible=False),), Settings()) == verdict
+
+
+@pytest.mark.parametrize(("closed", "verdict"), [(0.7, "LISTED_WITH_REMAINDER"), (0.99, "LISTED")])
+def test_what_was_not_looked_for_any_more_is_left(closed, verdict):
+    found = evidence("mean", 0.5, asked_for=("b",))
+    assert decide(found, (cause(closed),), Settings()) == verdict
 
 
 def test_no_cause_is_unlisted_where_a_site_is_wrong():

@@ -27,6 +27,19 @@ def test_what_explanations_share_is_said_first(sets, said):
     assert summary("UNDETERMINED", (cause,), SimpleNamespace()) == said
 
 
+def test_effects_that_were_not_looked_for_any_more_are_said():
+    cause = SimpleNamespace(effects=("a",), alias_class=(("a",),), closed_fraction=None)
+    evidence = SimpleNamespace(asked_for=("b",), accepted=("a",))
+    assert summary("LISTED_WITH_REMAINDER", (cause,), evidence) == (
+        "Most of the gap comes from a; only one effect was looked for, and b may explain some of what is left."
+    )
+
+
+def test_a_gap_within_the_tolerance_is_a_gap():
+    assert summary("NO_GAP", (), SimpleNamespace(), tolerated=True).startswith("A gap was found")
+    assert summary("NO_GAP", (), SimpleNamespace()).startswith("No gap was found")
+
+
 @pytest.mark.parametrize(("effects", "said"), [(("a",), "a imitates"), (("a", "b"), "a and b imitate")])
 def test_what_imitates_part_of_an_unknown_cause_is_said(effects, said):
     cause = SimpleNamespace(effects=effects, alias_class=(effects,), closed_fraction=None)

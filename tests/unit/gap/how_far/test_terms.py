@@ -10,7 +10,7 @@ import pytest
 from dtprob.errors import InputError
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
-from dtprob.gap.how_far.terms import error_db, in_user_terms
+from dtprob.gap.how_far.terms import check_tolerance, in_user_terms, is_within
 from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import Measure, declare, model
 from dtprob.models.multi_access import multi_access, records
@@ -72,14 +72,22 @@ def test_errors_are_in_the_unit_of_the_data(kind):
     assert found["twice_error"][0] == pytest.approx(np.sqrt(np.mean(by_run**2)), rel=1e-6)
 
 
-def test_a_tolerance_in_db_is_about_powers_and_what_has_a_signal():
-    problem, held, level = held_out("power", DATA["power"])
-    assert error_db(problem, held) == pytest.approx(in_user_terms(problem, held, None)["y_rmse_db"][0])
-    problem, held, level = held_out("normal", DATA["normal"])
-    ratio = ((DATA["normal"] - level) ** 2).sum() / (DATA["normal"] ** 2).sum()
-    assert error_db(problem, held) == pytest.approx(10 * np.log10(ratio))
-    problem, held, _ = held_out("counts", DATA["counts"])
-    assert error_db(problem, held) is None
+@pytest.mark.parametrize("kind", sorted(DATA))
+def test_a_tolerance_is_compared_with_the_error_in_the_unit_of_the_data(kind):
+    """Levels in dBm are numbers far from zero: an error relative to these would make any fault of a few dB a small one."""
+    problem, held, _ = held_out(kind, DATA[kind])
+    error = next(
+        value for name, (value, _) in in_user_terms(problem, held, None).items() if name != "twice_error"
+    )
+    assert is_within(problem, held, 1.001 * error)
+    assert not is_within(problem, held, 0.999 * error)
+
+
+def test_a_tolerance_says_nothing_of_classes():
+    problem, held, _ = held_out("outcomes", RNG.integers(0, 2, (RUNS, ROWS)))
+    check_tolerance(problem, held.misses, None)
+    with pytest.raises(InputError, match=r"tolerance_db.*Bernoulli.*Leave the tolerance out"):
+        check_tolerance(problem, held.misses, 1.0)
 
 
 def test_outcomes_have_no_error_but_measures():

@@ -155,7 +155,7 @@ def test_misses_are_sums_over_each_cluster():
     data = problem.data
     np.testing.assert_allclose(missed.count, data["y"].shape[1])
     np.testing.assert_allclose(missed.error, ((data["y"] - 0.7 + 1.2 * data["x"]) ** 2).sum(1), rtol=1e-12)
-    np.testing.assert_allclose(missed.signal, (data["y"] ** 2).sum(1), rtol=1e-12)
+    assert not missed.signal.any()  # of real readings an error relative to these says nothing
 
 
 def test_a_reference_takes_the_place_of_the_prior():
