@@ -124,7 +124,8 @@ class DiagnosisSection:
         max_effects: the largest set of effects that is looked for.
         relevance: share of the gap that causes have to close to be named where something is left. Less of it suits
             data whose twin is known to lack more than is on the list.
-        tolerance_db: residual error that does not matter, in dB below the signal; of powers, their rms error in dB.
+        tolerance_db: residual error that does not matter, in dB below the signal; of powers, their rms error in dB, and of
+            other readings, such as levels in dBm, that in their own unit.
     """
 
     candidates: int = 8

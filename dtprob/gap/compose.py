@@ -38,16 +38,17 @@ def compose(
     """The diagnosis with all sections of the report."""
     first = evidence.steps[0].view.screening
     told_along = along(evidence)
+    tolerated = verdict == "NO_GAP" and evidence.steps[0].view.alarmed(settings)
     sections: dict[str, Any] = {
         "tried": _tried(evidence),
         "where": where(evidence, told_along),
-        "gap": _gap(evidence),
+        "gap": {**_gap(evidence), "tolerated": tolerated},
         "unlisted": unlisted(evidence.after, settings.level / 2),
         "remainder": _remainder(evidence),
         "detectable": [
-            {"effect": name, "size": size, "parameter": e.parameters[0].name, "unit": e.parameters[0].unit}
-            for name, size, e in zip(first.names, first.detectable, evidence.problem.effects, strict=True)
-            if np.isfinite(size)
+            {"effect": name, "size": one.size, "parameter": one.parameter.name, "unit": one.parameter.unit}
+            for name, one in zip(first.names, first.detectable, strict=True)
+            if one is not None
         ],
         "screening": _screening(evidence),
         "fit": _fit(evidence, jax.random.fold_in(key, 3)),
@@ -59,11 +60,20 @@ def compose(
         },
     }
     arrays = maps(evidence, closed_shares(told_along))
-    return Diagnosis(verdict, summary(verdict, causes, evidence), causes, sections, arrays)
+    return Diagnosis(
+        verdict, summary(verdict, causes, evidence, tolerated=tolerated), causes, sections, arrays
+    )
 
 
-def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
-    """The verdict in one sentence."""
+def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence, *, tolerated: bool = False) -> str:
+    """The verdict in one sentence.
+
+    Args:
+        verdict: of the diagnosis.
+        causes: that it names.
+        evidence: that it has.
+        tolerated: whether there is a gap that only the user's tolerance calls none.
+    """
     best = causes[0] if causes else None
     name = " and ".join(best.effects) if best else ""
     closed_part = ""
@@ -74,11 +84,12 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
         )
     match verdict:
         case "NO_GAP":
-            return "No gap was found between the twin and the data."
+            seen = "A gap was found, but predictions err by no more than the tolerance that was set."
+            return seen if tolerated else "No gap was found between the twin and the data."
         case "LISTED":
             return f"The gap comes from {name}{closed_part}."
         case "LISTED_WITH_REMAINDER":
-            return f"Most of the gap comes from {name}{closed_part}; something that no known effect explains is left."
+            return f"Most of the gap comes from {name}{closed_part}; {_rest(evidence)} left."
         case "UNLISTED":
             sites = ", ".join(_place(s) for s in evidence.after.sites[:2] if s.p_value <= 0.01)
             tail = f" It shows at {sites}." if sites else ""
@@ -94,6 +105,15 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence) -> str:
             if best is None:
                 return "There are signs of a gap, but the data cannot tell which effect causes it."
             return _undecided(best.alias_class)
+
+
+def _rest(evidence: Evidence) -> str:
+    """What an answer leaves: the sites' remainder, or what was not looked for any more."""
+    if not evidence.asked_for:
+        return "something that no known effect explains is"
+    count = len(evidence.accepted)
+    looked = "only one effect was" if count == 1 else f"only {count} effects were"
+    return f"{looked} looked for, and {' and '.join(evidence.asked_for)} may explain some of what is"
 
 
 def _undecided(sets: Sequence[Sequence[str]]) -> str:
@@ -145,6 +165,7 @@ def _gap(evidence: Evidence) -> dict[str, Any]:
         "after": after,
         "floor": [0.0, max((best - evidence.floor.low) / n, 0.0)],
         "in_user_terms": {name: list(pair) for name, pair in terms.items()},
+        "own": sorted(block.name for block in evidence.problem.blocks_of(None) if block.local),
     }
 
 

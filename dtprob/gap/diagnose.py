@@ -20,11 +20,12 @@ from dtprob.gap.fitting.states import held
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
 from dtprob.gap.how_far.shares import shares
-from dtprob.gap.how_far.terms import error_db
+from dtprob.gap.how_far.terms import check_tolerance, is_within
 from dtprob.gap.model.nulls import check_nulls
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
+from dtprob.gap.view import View
 from dtprob.gap.where.locate import most_left
 from dtprob.gap.which.classes import credible
 from dtprob.gap.which.confirm import confirm
@@ -35,6 +36,7 @@ from dtprob.inference.fit import resolve
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Data, Model
 from dtprob.models.indices import check_indices
+from dtprob.models.supported import differentiated_forwards
 
 _DEFAULT = Settings()
 
@@ -104,9 +106,11 @@ def diagnose(
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
     keys = jax.random.split(key, 3)
     say(f"fitting the base model to {problem.n_cluster} clusters")
-    start = based(problem, keys[0], polished=settings.polished, say=say)
+    with differentiated_forwards():
+        start = based(problem, keys[0], polished=settings.polished, say=say)
     problem, base = start.problem, start.fitted
     check_noise(problem, base)
+    check_tolerance(problem, problem.compiled.misses(base.x), settings.tolerance_db)
     noted = notes(problem, base)
     for note in noted:
         say(f"note: {note}")
@@ -122,7 +126,11 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
         folds = list(closed.fold_fits(last.problem, last.fitted, assignment))
         held_after = closed.judged(last.problem, folds)
     wrong = [s for s in last.location.sites if s.p_value <= settings.level / 2]
-    remains, left = bool(wrong), most_left(wrong)
+    asked_for = _asked_for(last, settings)
+    remains, left = (
+        bool(wrong),
+        max(most_left(wrong), *(last.screening.promise_of(n) for n in asked_for), 0.0),
+    )
     floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     fraction = (
         closed.closed_fraction(held_before, held_after, floor, keys[2]) if last.fitted.effects else None
@@ -134,7 +142,14 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
         say("modelling what is left at its site")
         rest = model_remainder(last, folds, held_after, floor.best, keys[2])
     judged = problem, base, tuple(steps), held_before, held_after, floor, fraction, parts, noted
-    return Evidence(*judged, remainder=rest, rivals=searched.rivals)
+    return Evidence(*judged, remainder=rest, rivals=searched.rivals, asked_for=asked_for)
+
+
+def _asked_for(last: View, settings: Settings) -> tuple[str, ...]:
+    """The candidate that the scores call for most, where as many effects as are looked for have been accepted."""
+    if len(last.fitted.effects) < settings.max_effects or not last.screening.shows_gap(settings):
+        return ()
+    return (last.screening.names[int(np.argmax(last.screening.log_bayes_factor))],)
 
 
 def _causes(
@@ -185,11 +200,11 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
     is_too_large = not cause.plausible and _are_fields(evidence)
     if remains and (is_poor or is_too_large):
         return "UNLISTED"
-    leaves = remains and (cause.closed_fraction.mean < 1 - settings.minor or _are_fields(evidence))
+    is_left = remains or bool(evidence.asked_for)
+    leaves = is_left and (cause.closed_fraction.mean < 1 - settings.minor or _are_fields(evidence))
     if cause.probability < settings.credibility:
-        return (
-            "UNLISTED" if leaves else "UNDETERMINED"
-        )  # equally good sets that all leave something are imitations
+        # equally good sets that all leave something are imitations
+        return "UNLISTED" if leaves and remains else "UNDETERMINED"
     return "LISTED_WITH_REMAINDER" if leaves else "LISTED"
 
 
@@ -206,7 +221,4 @@ def _are_fields(evidence: Evidence) -> bool:
 def _negligible(evidence: Evidence, settings: Settings) -> bool:
     """Whether the base model's held-out error is already below what the user cares about."""
     tolerance = settings.tolerance_db
-    error = None if tolerance is None else error_db(evidence.problem, evidence.held_before)
-    if tolerance is None or error is None:
-        return False
-    return error <= (abs(tolerance) if evidence.problem.has_powers else -abs(tolerance))
+    return tolerance is not None and is_within(evidence.problem, evidence.held_before, tolerance)

@@ -19,7 +19,8 @@ from dtprob.gap.which.trials import Start
 class Evidence:
     """The base fit, the steps of the search and the held-out losses before and after the accepted effects.
 
-    `notes` says what is wrong with the base fit itself; `rivals` are where the search ended on its other ways.
+    `notes` says what is wrong with the base fit itself; `rivals` are where the search ended on its other ways; `asked_for`
+    are effects that the scores still call for where no more of them were looked for.
     """
 
     problem: Problem
@@ -33,6 +34,7 @@ class Evidence:
     notes: tuple[str, ...] = ()
     remainder: Remainder | None = None
     rivals: tuple[Start, ...] = ()
+    asked_for: tuple[str, ...] = ()
 
     @property
     def before(self) -> Location:

@@ -13,7 +13,7 @@ from dtprob.gap.where.reach import Told, reached, told
 _TOLD: Final = 0.01
 """Probability up to which a site comes before those that have no more than a larger share."""
 _LEAST_GAP: Final = 1.0
-"""Nats of a gap of which a site can have a share."""
+"""Nats of a gap of which a site, or a part of the data, can have a share."""
 
 
 def along(evidence: Evidence) -> dict[str, Told]:
@@ -33,7 +33,6 @@ def where(evidence: Evidence, told_along: Mapping[str, Told]) -> dict[str, Any]:
     blocks = reached(told_along, evidence.problem.declaration.cluster)
     axes = {block.axis for block in blocks}  # on all others the blocks whose misfit stands out
     coordinates = (*blocks, *(b for b in evidence.before.coordinates if b.axis not in axes))
-    excess = sum(c.excess for c in coordinates) or 1.0
     accepted = [e for e in evidence.problem.effects if e.name in evidence.accepted]
     share = evidence.fraction.mean if evidence.fraction is not None else 0.0
     closed = {site: share for effect in accepted for site in effect.sites}
@@ -45,7 +44,7 @@ def where(evidence: Evidence, told_along: Mapping[str, Told]) -> dict[str, Any]:
             {
                 "axes": {c.axis: [c.low, c.high]},
                 "p_value": c.p_value,
-                "share": max(c.excess, 0.0) / max(excess, c.excess),
+                "share": min(max(c.excess, 0.0) / gap, 1.0) if gap >= _LEAST_GAP else None,
             }
             for c in coordinates
         ],

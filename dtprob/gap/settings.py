@@ -25,8 +25,8 @@ class Settings:
         relevance: share of the gap that causes must close to count as its explanation where something is left.
         field_relevance: the same of random fields alone, which can imitate nearly anything.
         minor: a further effect must add this share of the evidence that the effects before it have brought.
-        tolerance_db: residual error that the user does not care about, in dB below the signal; of powers, their rms
-            error in dB. None for no tolerance.
+        tolerance_db: residual error that the user does not care about, in dB below the signal; of powers, their root mean
+            square error in dB, and of other readings, such as levels in dBm, that in their own unit. None for no tolerance.
     """
 
     level: float = 0.01

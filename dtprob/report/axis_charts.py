@@ -5,7 +5,7 @@ import xarray as xr
 
 from dtprob.report.axis_figures import coordinate_map, share_map, usual_limit
 from dtprob.report.chart import Chart, group
-from dtprob.report.json_schema import Report
+from dtprob.report.json_schema import Report, is_quiet
 from dtprob.report.names import capital, words
 from dtprob.report.svg import inline_svg
 from dtprob.report.units import number, scale_for
@@ -24,7 +24,7 @@ def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     named = [axis for entry in report["where"]["coordinates"] for axis in entry["axes"]]
     axes = [name[len(_BEFORE) :] for name in map(str, data) if _is_before(name) and data[name].count() > 1]
     ordered = sorted(axes, key=lambda axis: named.index(axis) if axis in named else len(named))
-    quiet = report["verdict"] == "NO_GAP"
+    quiet = is_quiet(report)
     return [_coordinate_chart(data, axis, quiet=quiet, named=axis in named) for axis in ordered[:_MOST_MAPS]]
 
 

@@ -8,7 +8,7 @@ import xarray as xr
 from dtprob.report.axis_charts import closed_charts, coordinate_charts, difference_charts
 from dtprob.report.chart import Chart, group
 from dtprob.report.figures import IntervalRow, classes_for, gap_track, interval_plot, plan_view
-from dtprob.report.json_schema import Interval, Report
+from dtprob.report.json_schema import Interval, Report, is_quiet
 from dtprob.report.names import capital, listing, together, words
 from dtprob.report.scene_view import Scene, scene, scene_view
 from dtprob.report.svg import inline_svg
@@ -29,7 +29,7 @@ def gap_chart(report: Report) -> Chart | None:
         told.append(f"Best possible: between {number(floor[0])} and {number(floor[1])}.")
     figure = gap_track(gap["before"], gap["after"], floor, unit=gap["unit"])
     caption = (
-        "Shorter bars are better; the best that any model could reach lies somewhere on the lowest line. With a loss "
+        "Shorter bars are better; the best that was found lies somewhere on the lowest line. With a loss "
         "of 0.1 nats per observation more, a twin finds what was measured about 10% less likely at each observation."
     )
     return Chart(
@@ -154,7 +154,7 @@ def all_charts(report: Report, gap: xr.DataTree | None) -> Iterator[tuple[str, C
     yield from (("coordinates", chart) for chart in coordinate_charts(report, gap))
     yield from (("closed", chart) for chart in closed_charts(report, gap))
     yield from (("differences", chart) for chart in difference_charts(report, gap))
-    if report["verdict"] == "NO_GAP":  # bars and colours would make noise look like a finding
+    if is_quiet(report):  # bars and colours would make noise look like a finding
         return
     yield from (("plan", chart) for chart in plan_charts(report, gap))
     yield from (("scene", chart) for chart in scene_charts(report, gap))

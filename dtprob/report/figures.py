@@ -118,7 +118,7 @@ def gap_track(before: float, after: float | None, floor: tuple[float, float] | N
     Args:
         before: held-out loss of the twin as it is.
         after: held-out loss with the accepted effect, or None where none was accepted.
-        floor: bracket of the lowest loss that any model could reach, or None where unknown.
+        floor: bracket of the lowest loss that was found, or None where unknown.
         unit: unit of all of them.
     """
     rows = [("Twin as it is", before, LIGHT["before"])]

@@ -110,13 +110,19 @@ class Where(TypedDict):
 
 
 class Gap(TypedDict):
-    """How far: held-out loss before and after the accepted cause; `floor` brackets the lowest possible."""
+    """How far: held-out loss before and after the accepted cause; `floor` brackets the lowest possible.
+
+    `own` are unknowns that each cluster has for itself, found from its own readings even where these are held out;
+    `tolerated` says that there is a gap which only the user's tolerance calls none.
+    """
 
     unit: str
     before: Number
     after: Number
     floor: tuple[Number, Number] | None
     in_user_terms: dict[str, BeforeAfter]
+    own: NotRequired[list[str]]
+    tolerated: NotRequired[bool]
 
 
 class Unlisted(TypedDict):
@@ -212,6 +218,11 @@ class Report(TypedDict):
     screening: NotRequired[list[Candidate]]
     fit: NotRequired[Fit]
     provenance: dict[str, Any]
+
+
+def is_quiet(report: Report) -> bool:
+    """Whether there is nothing to tell of a gap: none was found, not even one that a tolerance calls none."""
+    return report["verdict"] == "NO_GAP" and not report["gap"].get("tolerated", False)
 
 
 def validate(report: Mapping[str, Any]) -> Report:

@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from dtprob.report import names, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Candidate, Interval, Report, Tried, validate
+from dtprob.report.json_schema import Candidate, Interval, Report, Tried, is_quiet, validate
 from dtprob.report.palette import DARK, LIGHT
 from dtprob.report.story import left_over, next_look, next_step, rivals, tell
 
@@ -49,6 +49,7 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
         .render(
             title=title,
             report=checked,
+            quiet=is_quiet(checked),
             story=tell(checked),
             next_step=next_step(checked),
             rivals=rivals(checked),

@@ -6,7 +6,7 @@ from typing import Any
 
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Cause, Detectable, Report, Site
+from dtprob.report.json_schema import Cause, Detectable, Report, Site, is_quiet
 from dtprob.report.names import (
     aliases,
     block,
@@ -24,7 +24,7 @@ from dtprob.report.names import (
     together,
     words,
 )
-from dtprob.report.units import DASH, percent
+from dtprob.report.units import DASH, number, percent
 
 
 @dataclass(frozen=True)
@@ -134,6 +134,8 @@ def _codes(report: Report) -> set[str]:
 
 
 def _no_gap(report: Report) -> Story:
+    if not is_quiet(report):
+        return _tolerated(report)
     screened = report.get("screening", [])
     untold = sum(bool(row.get("absorbed_by")) for row in screened)
     tried = f"{len(screened) - untold} known effects were tried; none of them is needed to explain these data, and"
@@ -150,6 +152,20 @@ def _no_gap(report: Report) -> Story:
         if screened
         else "No effects were given to try; the twin's own quantities differ from the data by no more than chance.",
         "Nothing to change in the twin.",
+    )
+
+
+def _tolerated(report: Report) -> Story:
+    terms = report["gap"]["in_user_terms"]
+    errors = listing(f"{term(name)} {number(pair[0], digits=2)}" for name, pair in terms.items())
+    best = f" What closes most of it: {together(report['causes'][0]['effects'])}." if report["causes"] else ""
+    return Story(
+        "No gap that matters",
+        "good",
+        "A gap was found, but it is within the tolerance.",
+        f"The twin differs from the data by more than chance{_seat(report)}, but errs by no more than you said does not "
+        f"matter: {errors}.{best}",
+        "Nothing to change in the twin for this tolerance.",
     )
 
 
@@ -181,6 +197,15 @@ def _listed(report: Report) -> Story:
 
 def _remainder(report: Report) -> Story:
     cause = report["causes"][0]
+    if not report["unlisted"]["sites"]:  # as many effects as are looked for have been named
+        return Story(
+            "Causes found, perhaps not all",
+            "partly",
+            f"Part of the gap comes from {_named(cause)}. Others may be there.",
+            f"{_closing(cause)} No more effects were looked for, and one more is called for."
+            f"{_matters(report)}{_looks_alike(cause)}",
+            f"{_change(cause)} Then diagnose again with more effects at once (max_effects).",
+        )
     return Story(
         "Cause found, but something is left",
         "partly",
@@ -221,9 +246,11 @@ def _undetermined(report: Report) -> Story:
     else:
         signs = f"signs of {names[0]}" if names else "signs of a gap"
         headline = f"There are {signs}, but the data do not confirm them."
+        held = (
+            "did not hold on data that its fit had left out" if names else "is not enough to name an effect"
+        )
         meaning = (
-            "What was found in one part of the data did not hold in the part that was kept apart. "
-            "It may be chance, or an effect too small for this amount of data; "
+            f"What was found {held}. It may be chance, or an effect too small for this amount of data; "
             "more data of the same kind would decide."
         )
     return Story("Cause undecided", "partly", headline, meaning, f"Do not change the twin yet.{wait}")
@@ -260,7 +287,7 @@ def _closing(cause: Cause) -> str:
         return "How much of the gap this closes could not be established."
     return (
         f"Added to the twin, this closes {percent(closed['mean'])} of the gap "
-        f"(90% interval {shares(closed)}) on data that were not used to find it."
+        f"(90% interval {shares(closed)}), judged on data left out when its size was fitted."
     )
 
 

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 import numpy as np
 
+from dtprob.errors import InputError
 from dtprob.gap.how_far.closed import HeldOut
+from dtprob.gap.model.misses import Miss
 from dtprob.gap.model.problem import Problem
 
 
@@ -45,12 +49,48 @@ def _decibels(error: float, signal: float) -> float:
     return float(10 * np.log10(max(float(error) / max(float(signal), 1e-300), 1e-300)))
 
 
-def error_db(problem: Problem, held: HeldOut) -> float | None:
-    """One error in dB over all sites: normalised mean square, of powers root mean square; None where there is neither."""
-    seen = [held.misses[name] for name in held.misses if name in problem.declaration.observed]
-    with_signal = [miss for miss in seen if np.sum(miss.signal) > 0]
-    error = sum(float(np.sum(miss.error)) for miss in with_signal)
-    signal = sum(float(np.sum(miss.signal)) for miss in with_signal)
-    if signal <= 0:
+def check_tolerance(problem: Problem, missed: Mapping[str, Miss], tolerance: float | None) -> None:
+    """Refuse a tolerance where predictions have no one error that it could be compared with.
+
+    Raises:
+        InputError: what is observed are classes, or several quantities of different units.
+    """
+    if tolerance is None or _whole_error(problem, missed) is not None:
+        return
+    raise InputError(
+        "tolerance_db",
+        "complex channels, powers, or readings of one kind that have a mean",
+        ", ".join(f"{name} ({family})" for name, family in problem.families.items()),
+        "Leave the tolerance out",
+    )
+
+
+def is_within(problem: Problem, held: HeldOut, tolerance: float) -> bool:
+    """Whether predictions of clusters left out err by no more than a tolerance.
+
+    Args:
+        problem: the model on its data.
+        held: held-out results.
+        tolerance: of complex channels in dB below the signal; of all else the root mean square error, of powers in dB, of
+            readings in their own unit.
+    """
+    error = _whole_error(problem, held.misses)
+    if error is None:
+        return False
+    return error <= (-abs(tolerance) if _complex_sites(problem) else abs(tolerance))
+
+
+def _whole_error(problem: Problem, missed: Mapping[str, Miss]) -> float | None:
+    """The error that a tolerance is compared with; None where there is none, or none over all that is observed."""
+    relative = [missed[name] for name in _complex_sites(problem) if name in missed]
+    if relative:
+        return _decibels(sum(m.error.sum() for m in relative), sum(m.signal.sum() for m in relative))
+    seen = [missed[name] for name in problem.declaration.observed if name in missed]
+    if not seen or (len(seen) > 1 and not problem.has_powers):
         return None
-    return float(np.sqrt(error / signal)) if problem.has_powers else _decibels(error, signal)
+    count = sum(miss.count.sum() for miss in seen)
+    return float(np.sqrt(sum(miss.error.sum() for miss in seen) / max(count, 1.0)))
+
+
+def _complex_sites(problem: Problem) -> list[str]:
+    return [name for name, site in problem.declaration.observed.items() if site.is_complex]

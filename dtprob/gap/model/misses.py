@@ -23,7 +23,7 @@ class Miss(NamedTuple):
 
     Attributes:
         error: of squared errors; those of log-normal observations, as received powers are, in dB.
-        signal: of squares of what was seen; zero where a relative error says nothing.
+        signal: of squares of complex numbers that were seen; zero of all else, of which a relative error says nothing.
         count: of entries.
     """
 
@@ -58,14 +58,15 @@ def _entries(
     """Squared error, squared signal and one for each entry; None of outcomes and classes, which have no mean."""
     parameters, one, nothing = observation.parameters, jnp.ones(value.shape), jnp.zeros(value.shape)
     if observation.family == "LogNormal":
-        return (_DECIBELS * (jnp.log(value) - parameters["loc"])) ** 2, one, one
+        return (_DECIBELS * (jnp.log(value) - parameters["loc"])) ** 2, nothing, one
     if observation.family == "VonMises":
         return jnp.angle(jnp.exp(1j * (value - parameters["loc"]))) ** 2, nothing, one
     expected = likelihood(observation.family).mean
     if expected is not None:
         return (value - expected(parameters)) ** 2, nothing, one
     if "loc" in parameters:
-        return jnp.abs(value - parameters["loc"]) ** 2, jnp.abs(value) ** 2, one
+        signal = jnp.abs(value) ** 2 if jnp.iscomplexobj(value) else nothing
+        return jnp.abs(value - parameters["loc"]) ** 2, signal, one
     if likelihood(observation.family).is_outcome:
         return None
     return (value - whiten.distribution(observation).mean) ** 2, nothing, one
