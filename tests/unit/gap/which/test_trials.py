@@ -20,10 +20,11 @@ def effect(name):
     )
 
 
-def chosen(scores, scans, count, absorbed=(), *, noise=(), promise=1000.0):
+def chosen(scores, scans, count, absorbed=(), *, noise=(), promise=1000.0, alarms=()):
     screening = SimpleNamespace(
         names=NAMES,
         absorbed_by=["gain" if name in absorbed else None for name in NAMES],
+        adjusted=np.array([1e-4 if name in alarms else 1.0 for name in NAMES]),
         locates=[name not in noise for name in NAMES],
         log_bayes_factor=np.array([scores.get(name, -1.0) for name in NAMES]),
     )
@@ -57,6 +58,13 @@ def test_what_gains_nothing_or_is_absorbed_is_not_refitted():
     scans = [{"wall": 2.0, "tilt": np.inf}, {}]
     assert chosen({"near": 90.0, "far": 1.0}, scans, 6, absorbed=("tilt",)) == ["near"]
     assert chosen({}, [], 6) == []
+
+
+def test_what_rings_the_alarm_is_refitted_though_nuisances_absorb_nearly_all_of_it():
+    """Another one, which nothing calls for, was named in its place."""
+    scores = {"near": 9.0, "tilt": 4.0}
+    assert chosen(scores, [], 6, absorbed=("near",), promise=20.0) == ["tilt"]
+    assert chosen(scores, [], 6, absorbed=("near",), promise=20.0, alarms=("near",)) == ["near", "tilt"]
 
 
 def test_what_gains_at_its_whole_size_at_the_fit_is_not_absorbed():
