@@ -22,9 +22,10 @@ from dtprob.report.names import (
     spoken,
     term,
     together,
+    user_terms,
     words,
 )
-from dtprob.report.units import DASH, number, percent
+from dtprob.report.units import DASH, percent
 
 
 @dataclass(frozen=True)
@@ -157,14 +158,14 @@ def _no_gap(report: Report) -> Story:
 
 def _tolerated(report: Report) -> Story:
     terms = report["gap"]["in_user_terms"]
-    errors = listing(f"{term(name)} {number(pair[0], digits=2)}" for name, pair in terms.items())
+    errors = listing(f"{term(name)} {user_terms(name, *pair)[0]}" for name, pair in terms.items())
     best = f" What closes most of it: {together(report['causes'][0]['effects'])}." if report["causes"] else ""
     return Story(
         "No gap that matters",
         "good",
         "A gap was found, but it is within the tolerance.",
-        f"The twin differs from the data by more than chance{_seat(report)}, but errs by no more than you said does not "
-        f"matter: {errors}.{best}",
+        f"The difference between twin and data is more than chance{_seat(report)}, but predictions err by no more than "
+        f"you said does not matter: {errors}.{best}",
         "Nothing to change in the twin for this tolerance.",
     )
 

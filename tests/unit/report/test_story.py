@@ -236,3 +236,20 @@ def test_candidates_are_ranked_and_untested_ones_come_last() -> None:
     rows.append({**row("absorbed", -6.1, 1.0), "absorbed_by": "gain"})
     ranks = [candidate["effect"] for candidate in ranked(rows)]
     assert ranks == ["strong", "medium", "weak", "none", "absorbed"]
+
+
+def test_a_gap_that_a_tolerance_calls_none_is_told() -> None:
+    report = {**_report(power_rmse_db=[2.62, 2.48]), "verdict": "NO_GAP"}
+    assert tell(report).label == "No gap found"
+    report["gap"]["tolerated"] = True
+    story = tell(report)
+    assert story.label == "No gap that matters"
+    assert "power error (root mean square) 2.6\u202fdB." in story.meaning
+    assert "What closes most of it: a." in story.meaning
+
+
+def test_effects_that_were_not_looked_for_any_more_are_told() -> None:
+    report = {**_report(), "verdict": "LISTED_WITH_REMAINDER"}
+    assert tell(report).label == "Causes found, perhaps not all"
+    report["unlisted"]["sites"] = ["y"]
+    assert tell(report).label == "Cause found, but something is left"
