@@ -256,8 +256,13 @@ def test_sizes_come_from_the_engine():
 
 
 def test_a_tolerance_makes_a_small_gap_none():
-    data = draw("line", seed=10, shift=0.5 * inputs() ** 2)  # listed without one
-    assert run(line, data, settings=Settings(replicates=200, tolerance_db=0.5)).verdict == "NO_GAP"
+    """Of a gap that is listed without one: errors are 1.1 in the unit of the data, whose noise is 0.5."""
+    data = draw("line", seed=10, shift=0.5 * inputs() ** 2)
+    found = run(line, data, settings=Settings(replicates=200, tolerance_db=1.5))
+    assert found.verdict == "NO_GAP"
+    assert found.sections["gap"]["tolerated"]
+    assert found.causes
+    assert found.summary.startswith("A gap was found")
 
 
 def rows(x, device, y=None):
