@@ -16,7 +16,7 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.active import LOG_2PI, Active, activate
-from dtprob.gap.fitting.density import moved, rescored, system_at, value_of, volume_of
+from dtprob.gap.fitting.density import cluster_terms, moved, rescored, system_at, value_of, volume_of
 from dtprob.gap.fitting.newton import NewtonStep, System, newton_step, positive
 from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
@@ -111,7 +111,8 @@ def fit(
         better = gained > 0
         converged = trial.gain < tolerance or (not better and trial.damping > _STUCK)
         if better:
-            x, value, damping = trial.x, trial.value, max(trial.damping / 8, _LEAST_DAMPING)
+            x, value = _guarded(problem, active, x, trial.x), trial.value
+            damping = max(trial.damping / 8, _LEAST_DAMPING)
         change = 0.0
         if active.spread:
             active, change, latest = respread(problem, active, x, system, latest)
@@ -129,6 +130,21 @@ def _hopeless(active: Active, x: np.ndarray) -> Fit:
     """The fit of a starting point that leads where the model or its derivatives are not finite."""
     index, names = active.global_index, tuple(e.name for e in active.effects)
     return Fit(x, names, active.spread, -np.inf, -np.inf, np.eye(len(index)), index, False)
+
+
+def _guarded(problem: Problem, active: Active, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+    """The point after a step, own unknowns of clusters that are left out where these are better off.
+
+    Nothing else judges how far they go.
+    """
+    index = active.local_index[active.weights == 0]
+    if not index.size:
+        return after
+    held = after.copy()
+    held[index] = before[index]
+    stay, go = (cluster_terms(problem, active, x)[active.weights == 0] for x in (held, after))
+    held[index[go > stay]] = after[index[go > stay]]
+    return held
 
 
 class _Trial(NamedTuple):

@@ -7,7 +7,7 @@ import numpyro.distributions as dist
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting.active import activate
-from dtprob.gap.fitting.fit import fit
+from dtprob.gap.fitting.fit import _guarded, fit
 from dtprob.gap.fitting.marginal import own_mode
 from dtprob.gap.model.problem import Problem
 
@@ -77,3 +77,16 @@ def test_each_cluster_finds_its_own_mode_at_its_own_pace():
     level = x[problem.layout["level"].index[:, 0]]
     slope = y.sum(axis=1) - 3 * np.exp(level) - level / 4.0
     assert np.abs(slope / np.sqrt(3 * np.exp(level) + 0.25)).max() < 0.1
+
+
+def test_no_step_leads_a_cluster_that_is_left_out_astray():
+    """Nothing else judges it: levels went where the likelihood was no number."""
+    problem, found = shared(Y, KEPT.astype(float))
+    active = activate(problem, weights=KEPT.astype(float))
+    level = problem.layout["level"].index[:, 0]
+    after = found.x.copy()
+    after[level] += 1.0
+    after[level[-1]] = np.inf
+    kept = _guarded(problem, active, found.x, after)
+    np.testing.assert_array_equal(kept[level[:18]], after[level[:18]])
+    np.testing.assert_array_equal(kept[level[18:]], found.x[level[18:]])
