@@ -6,9 +6,10 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.effects import FAMILIES, Effect, Parameter, catalogue, summaries
+from dtprob.effects import FAMILIES, Effect, Parameter, catalogue, meaning, summaries
 from dtprob.errors import InputError
 from dtprob.models.declaration import Site, declare, model
+from dtprob.models.scene import AXES
 
 USER = Effect(
     "mine", {"path_gain": lambda value, p, _: value * (1 + p["a"])}, (Parameter("a", dist.Normal()),)
@@ -59,6 +60,11 @@ def test_two_antennas_are_calibrated_once(build_world, world):
     pair = build_world(tx_array=world.data["tx_array"][:2])
     names = [e.name for e in catalogue(pair.sites, pair.data, ["array_calibration", "cable_delay"])]
     assert [name for name in names if "tx" in name] == ["array_calibration[tx]", "cable_delay[tx_1]"]
+
+
+def test_effects_take_sites_for_what_the_models_mean_by_them():
+    assert {name: axes for name, axes in AXES.items() if meaning._AXES.get(name, axes) != axes} == {}
+    assert AXES.keys() - meaning._AXES.keys() == {"path_response"}  # which no effect rewrites
 
 
 @numpyro.handlers.seed(rng_seed=0)
