@@ -127,10 +127,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
         held_after = closed.judged(last.problem, folds)
     wrong = [s for s in last.location.sites if s.p_value <= settings.level / 2]
     asked_for = _asked_for(last, settings)
-    remains, left = (
-        bool(wrong),
-        max(most_left(wrong), *(last.screening.promise_of(n) for n in asked_for), 0.0),
-    )
+    remains, left = bool(wrong), max([most_left(wrong), *map(last.screening.promise_of, asked_for)])
     floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     fraction = (
         closed.closed_fraction(held_before, held_after, floor, keys[2]) if last.fitted.effects else None

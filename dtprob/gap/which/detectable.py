@@ -60,5 +60,5 @@ def _needed(directions: int, level: float) -> float:
 
 def _owner(effect: Effect, position: int) -> Parameter:
     """The parameter that one of the flat entries belongs to."""
-    ends = np.cumsum([int(np.prod(p.shape, dtype=int)) for p in effect.parameters])
+    ends = np.cumsum([p.size for p in effect.parameters])
     return effect.parameters[int(np.searchsorted(ends, position, side="right"))]

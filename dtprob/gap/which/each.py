@@ -99,10 +99,9 @@ def _alike(
 
 def _may_be(effect: Effect, trials: Trials) -> bool:
     """Whether an effect has as many sizes as a cluster has entries, and rewrites the same sites."""
-    size = sum(int(np.prod(p.shape, dtype=int)) for p in effect.parameters)
     return (
         effect.kind == "mean"
-        and size == trials.entries
+        and sum(p.size for p in effect.parameters) == trials.entries
         and not places(effect).any()
         and effect.rewrites.keys() == trials.effect.rewrites.keys()
     )

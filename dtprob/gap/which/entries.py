@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float
 from scipy import ndimage
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import scales, sizes
+from dtprob.gap.fitting.plausible import plausible_spread
 from dtprob.gap.fitting.sweep import turned_by, turns
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.directions import Surroundings
@@ -119,7 +119,7 @@ class Trials:
     @cached_property
     def grid(self) -> _Grid:
         """Entries as close together as each alone makes the log posterior wave, the null among them."""
-        spread = float(scales(self.effect)[sizes(self.effect)].max())
+        spread = plausible_spread(self.effect)
         offsets = np.linspace(-_REACH, _REACH, _LINE) * spread
         counts = []
         for j in range(self.entries):
