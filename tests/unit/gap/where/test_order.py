@@ -9,6 +9,7 @@ import pytest
 
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.settings import Settings
+from dtprob.gap.where.locate import SiteFinding, _shadows_last
 from dtprob.inference import Laplace
 from dtprob.models.declaration import model
 
@@ -34,3 +35,11 @@ def test_a_site_that_acts_through_another_alone_comes_after_it(seed):
     assert found.verdict == "UNLISTED"
     assert found.sections["unlisted"]["sites"][:2] == ["power", "distance"]
     assert [one["site"] for one in found.sections["where"]["sites"][:2]] == ["power", "distance"]
+
+
+@pytest.mark.parametrize(("of_spread", "first"), [(1e-3, "mean"), (1e-6, "mean"), (1e-12, "deviation")])
+def test_a_site_that_only_spreads_comes_after_values_that_are_surely_wrong(of_spread, first):
+    """By whatever name; unless it is more than twice as surely wrong."""
+    mean = SiteFinding("mean", "additive, common", 1e-4, 20.0)
+    deviation = SiteFinding("deviation", "relative, common", of_spread, 20.0, spreads=True)
+    assert min(_shadows_last([deviation, mean]), key=lambda found: found.last).site == first

@@ -1,0 +1,57 @@
+"""Sizes of accepted causes: engines agree, beside random fields too."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.gap.fitting.base import fit_base
+from dtprob.gap.fitting.fit import fit
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.which.confirm import confirm
+from dtprob.inference import NUTS, Laplace
+from dtprob.models.declaration import model
+
+LINKS, READINGS = 40, 6
+
+
+@model(axes={"expected": ("link", "reading")}, cluster="link")
+def levels(group, y=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    expected = numpyro.deterministic("expected", level + 0.0 * group)
+    with numpyro.plate("link", LINKS, dim=-2), numpyro.plate("reading", READINGS, dim=-1):
+        numpyro.sample("y", dist.Normal(expected, 1.0), obs=y)
+
+
+OFFSET = Effect(
+    "offset",
+    {"expected": lambda value, p, context: value + p["by"] * context["group"]},
+    (Parameter("by", dist.Normal(0.0, 5.0)),),
+)
+SHADOWING = Effect(
+    "shadowing",
+    {"expected": lambda value, p, context: value + p["scale"] * p[FIELD]},
+    (Parameter("scale", dist.HalfNormal(3.0)),),
+    kind="variance",
+    field_shape=lambda value, context: (value.shape[0], 1),
+)
+
+
+def test_a_sampler_draws_the_accepted_fields_too():
+    """Without them links were independent readings, and the interval of the offset half as wide."""
+    rng = np.random.default_rng(1)
+    group = np.repeat(np.arange(LINKS)[:, None] % 2, READINGS, axis=1).astype(float)
+    y = 3.0 * group + 1.5 * rng.normal(size=(LINKS, 1)) + rng.normal(size=group.shape)
+    problem = Problem(levels, {"group": jnp.asarray(group), "y": jnp.asarray(y)}, [OFFSET, SHADOWING])
+    base = fit_base(problem, jax.random.key(0))
+    names = ["offset", "shadowing"]
+    wider = problem.with_live(names)
+    found = fit(wider, wider.translate(base.x, problem), names)
+    widths = []
+    for engine in (Laplace(), NUTS(draws=500, warmup=500)):
+        sizes, _ = confirm(wider, found, [OFFSET, SHADOWING], jax.random.key(1), engine)
+        offset = next(size for size in sizes if size.name.startswith("offset"))
+        widths.append(offset.high - offset.low)
+    np.testing.assert_allclose(widths[1], widths[0], rtol=0.25)
