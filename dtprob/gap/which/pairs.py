@@ -8,7 +8,7 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import log_bayes_factor, scales
+from dtprob.gap.fitting.plausible import log_bayes_factor, scales, sides
 
 _MOST: Final = 80
 """Effects, the best alone, of which pairs are formed."""
@@ -31,7 +31,7 @@ def best_pairs(
     *,
     price: np.ndarray,
 ) -> tuple[Pair, ...]:
-    """The best pairs by Bayesian subset search on scores and their information.
+    """The best pairs by Bayesian subset search on scores and their information; none that data push below a null.
 
     Args:
         effects: mean effects.
@@ -46,6 +46,10 @@ def best_pairs(
     for i, j in itertools.combinations(chosen, 2):
         both = np.concatenate([groups[i], groups[j]])
         scale = np.concatenate([scales(effects[i]), scales(effects[j])])
-        value = log_bayes_factor(information[np.ix_(both, both)], score[both], scale) - price[[i, j]].sum()
+        sided = np.concatenate([sides(effects[i]), sides(effects[j])])
+        own = information[np.ix_(both, both)]
+        if sided.any() and (np.linalg.solve(own + np.diag(scale**-2.0), score[both])[sided] < 0).any():
+            continue
+        value = log_bayes_factor(own, score[both], scale) - price[[i, j]].sum()
         found.append(Pair((effects[i].name, effects[j].name), value))
     return tuple(sorted(found, key=lambda pair: -pair.log_bayes_factor)[:_KEPT])

@@ -14,6 +14,7 @@ import jax
 import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.bound import bound
 from dtprob.gap.fitting.marginal_mode import faithful
 from dtprob.gap.fitting.refit import BETTER, at_null_except, refit, starting_points, without
 from dtprob.gap.how_far.remainder import alone
@@ -107,10 +108,11 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         say(f"starting from {pair[0]} and {pair[1]} together")
         both = _refitted_with(steps[0].view, pair, settings)
         key = jax.random.fold_in(key, 2)
-        others = _forward(
-            both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=reached
-        )
-        ways.append([*steps[:-1], *others])
+        if not bound(both.problem, both.fitted):
+            others = _forward(
+                both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=reached
+            )
+            ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
     bare = steps[0].view
     if _stands_in(bare, ways[0][-1].view.fitted, base, field, say):

@@ -13,6 +13,7 @@ from scipy.special import gammaln
 
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.bound import bound
 from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -78,7 +79,7 @@ def tried(
     *,
     banned: str | None = None,
 ) -> Trials:
-    """Refits of the most promising candidates beside the effects of a view.
+    """Refits of the most promising candidates beside the effects of a view, without those that stay at their null.
 
     Args:
         seen: the fit, and what it calls for.
@@ -108,7 +109,8 @@ def tried(
         trials[name] = refit(problem, start, effects[name], starts)
     count = min(settings.polished, _POLISHED_LATER) if fitted.effects else settings.polished
     new = {name: one for name, one in trials.items() if name not in known}
-    return Trials(problem, {**trials, **polished(problem, start, new, count)})
+    every = {**trials, **polished(problem, start, new, count)}
+    return Trials(problem, {name: one for name, one in every.items() if name not in bound(problem, one)})
 
 
 def _scans(seen: View) -> list[dict[str, Found]]:
