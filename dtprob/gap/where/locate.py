@@ -29,6 +29,7 @@ from dtprob.gap.where.data_columns import whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
+from dtprob.gap.where.gains import gains
 from dtprob.gap.where.moments import further_moments, moment
 from dtprob.gap.where.quantities import Quantity, groups, quantity
 from dtprob.gap.where.suspects import Suspect, suspects
@@ -305,13 +306,10 @@ def _finding(
     best = min(tests, key=lambda test: (test.p_value, -float((test.first[0] ** 2).sum())))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
-    rows = drawn.rows[: 1 + CHANCE]
-    slope = np.einsum("ncm,ncm->n", shifts, rows)
-    curvature = np.einsum("ncm,ncm->n", shifts, shifts)
-    gain = np.where(curvature > 0, 0.5 * slope**2 / np.maximum(curvature, 1e-300), 0.0)
+    spread_rows = problem.rows.by_cluster(problem.rows.located) == 0
+    gain = gains(drawn.rows[: 1 + CHANCE], shifts, spread_rows)
     net = max(float(gain[0] - gain[1:].mean()), 0.0)
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
-    spread_rows = problem.rows.by_cluster(problem.rows.located) == 0
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][spread_rows] ** 2) > _ALL_SPREAD * moved)
     return SiteFinding(site.name, best.family.label, p_value, net, spreads=spreads)
