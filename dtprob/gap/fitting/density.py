@@ -24,12 +24,12 @@ def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
     flat = (e.size, n)
     curvature = (shared * weighted[..., None]).reshape(flat).T @ shared.reshape(flat)
     cross, local = transposed[:, :n] @ w[..., n:], transposed[:, n:] @ w[..., n:]
-    curvature = curvature + hessian[:n][:, g_index] + np.diag(effect_curvature[g_index])
-    if problem.volume is not None and n:
-        weights, volume = np.asarray(active.weights), problem.volume
-        free = np.flatnonzero(np.isin(volume.index, g_index))
-        place = np.searchsorted(g_index, volume.index[free])
-        curvature[np.ix_(place, place)] -= np.tensordot(weights, volume.bend, 1)[np.ix_(free, free)]
+    curvature = (
+        curvature
+        + hessian[:n][:, g_index]
+        + np.diag(effect_curvature[g_index])
+        - _bend_of_volume(problem, active)
+    )
     cross = cross + np.moveaxis(hessian[:n][:, l_index], 0, 1)
     local = local + np.moveaxis(hessian[n:][:, l_index], 0, 1)
     for j in range(l_index.shape[1]):
@@ -64,6 +64,48 @@ def _prior_at(
     if problem.volume is not None and len(active.global_index):
         gradient[problem.volume.index] += np.asarray(active.weights) @ problem.volume.gradient(x)
     return gradient, hessian, effect_curvature
+
+
+def curved(problem: Problem, active: Active, x: np.ndarray, system: System) -> System:
+    """A system whose curvatures are those of the log posterior itself at x.
+
+    Those of Gauss and Newton leave out how predictions bend. Where residuals are large, as those of phases are beside a
+    twin that is wrong elsewhere, steps by them hardly arrive.
+    """
+    g_index, l_index, n = active.global_index, active.local_index, len(active.global_index)
+    weights = np.asarray(active.weights, float)
+    rows = problem.compiled.curvature(x, weights, basis(problem, active))
+    counts = (weights > 0)[:, None, None]
+    each = np.where(counts, weights[:, None, None], 1.0)
+    cross = np.moveaxis(rows[:n][:, l_index], 0, 1) / each
+    local = (
+        np.moveaxis(rows[n:][:, l_index], 0, -1) / each
+        + np.eye(l_index.shape[1]) * system.bend[l_index][:, None]
+    )
+    curvature = rows[:n][:, g_index] + np.diag(system.bend[g_index]) - _bend_of_volume(problem, active)
+    return replace(
+        system,
+        curvature=_finite(curvature, system.curvature),
+        cross=np.where(counts, _finite(cross, system.cross), system.cross),
+        local=np.where(counts, _finite(local, system.local), system.local),
+    )
+
+
+def _finite(told: np.ndarray, otherwise: np.ndarray) -> np.ndarray:
+    """Curvatures (..., n, m), those that are not finite throughout replaced."""
+    return np.where(np.isfinite(told).all(axis=(-2, -1), keepdims=True), told, otherwise)
+
+
+def _bend_of_volume(problem: Problem, active: Active) -> np.ndarray:
+    """The Hessian (global, global) of what integrating unknowns out adds; zeros without."""
+    index = active.global_index
+    result = np.zeros((len(index), len(index)))
+    if problem.volume is not None and len(index):
+        weights, volume = np.asarray(active.weights), problem.volume
+        free = np.flatnonzero(np.isin(volume.index, index))
+        place = np.searchsorted(index, volume.index[free])
+        result[np.ix_(place, place)] = np.tensordot(weights, volume.bend, 1)[np.ix_(free, free)]
+    return result
 
 
 def rescored(problem: Problem, active: Active, x: np.ndarray, system: System) -> System:

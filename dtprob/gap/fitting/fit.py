@@ -16,7 +16,7 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.active import LOG_2PI, Active, activate
-from dtprob.gap.fitting.density import cluster_terms, moved, rescored, system_at, value_of, volume_of
+from dtprob.gap.fitting.density import cluster_terms, curved, moved, rescored, system_at, value_of, volume_of
 from dtprob.gap.fitting.newton import NewtonStep, System, newton_step, positive
 from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
@@ -26,6 +26,9 @@ from dtprob.gap.model.volume import Volume
 _TRIES: Final = 8
 _SETTLED: Final = 0.01
 """Change of the logarithm of a field's standard deviation below which it stands."""
+_PATIENCE: Final = 8
+"""Gauss-Newton steps with new curvatures that may not have arrived."""
+_FIRST_DAMPING: Final = 1e-3
 _LEAST_DAMPING: Final = 1e-12
 _FARTHEST: Final = 10.0
 """Standard deviations of its prior that an unknown of the base model moves in a step at most."""
@@ -89,24 +92,28 @@ def fit(
         x: flat vector to start from; coordinates of effects that are not free stay as they are.
         effects: names of the effects that are free.
         weights: per cluster, 0 leaves it out of the fit.
-        steps: at most so many Gauss-Newton steps, those that keep the last curvatures counting for a quarter.
+        steps: at most so many, those that keep the last curvatures counting for a quarter. They are Gauss-Newton steps, and
+            where clusters have unknowns of their own Newton steps once some of these have not arrived.
         tolerance: stop when the predicted gain in nats falls below.
         spread: first standard deviation of variance effects' fields by name; see `activate`.
     """
     active = activate(problem, effects, weights, spread)
-    x, damping, converged = np.array(x, float), 1e-3, False
+    x, damping, converged = np.array(x, float), _FIRST_DAMPING, False
     value = value_of(problem, active, x)
     if value == -np.inf and not np.isfinite(problem.compiled.residual(x)).all():
         return _hopeless(active, x)
     latest: Changes = {}
     last: System | None = None
+    patience, may_curve = _PATIENCE, bool(active.local_index.size)
     while steps > 0:
         fresh = last is None
         steps -= 1 if fresh else _CHEAP
         system = system_at(problem, active, x) if last is None else rescored(problem, active, x, last)
         if not system.finite:
             return _hopeless(active, x)
-        trial = _better(problem, active, system, x, value=value, damping=damping, tolerance=tolerance)
+        patience -= fresh
+        solved = curved(problem, active, x, system) if may_curve and patience < 0 and fresh else system
+        trial = _better(problem, active, solved, x, value=value, damping=damping, tolerance=tolerance)
         gained = trial.value - value
         better = gained > 0
         converged = trial.gain < tolerance or (not better and trial.damping > _STUCK)
@@ -120,9 +127,11 @@ def fit(
         converged = converged and change < _SETTLED
         ends = converged or not (better or change >= _SETTLED)
         if ends and fresh:  # kept curvatures may promise too little where they have fallen since
-            break
+            if converged or patience < 0 or not may_curve:
+                break
+            patience, damping = 0, _FIRST_DAMPING
         as_promised = _AS_PROMISED[0] * trial.gain < gained < _AS_PROMISED[1] * trial.gain
-        last = system if as_promised and not ends and change < _ALIKE else None
+        last = solved if as_promised and not ends and change < _ALIKE else None
     return _finish(problem, active, x, value, converged)
 
 

@@ -6,9 +6,10 @@ from functools import partial
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float, Int
 
-from dtprob.gap.fitting.active import LOG_2PI, Active, activate
-from dtprob.gap.fitting.density import cluster_terms, moved, system_at, terms_of
+from dtprob.gap.fitting.active import LOG_2PI, Active, activate, basis
+from dtprob.gap.fitting.density import cluster_terms, curved, moved, rescored, system_at, terms_of
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.newton import local_step, positive
 from dtprob.gap.fitting.sweep import swept
@@ -17,6 +18,8 @@ from dtprob.gap.model.problem import Problem
 _ROUNDS: Final = 4
 _DAMPING: Final = 1e-3
 """Of a cluster's first step, as a share of its curvatures."""
+_SLOW: Final = 2
+"""Steps by which the curvatures of Gauss and Newton should have arrived."""
 _GAIN: Final = 0.1
 """Nats by which a fit has to be better to be another one."""
 
@@ -43,7 +46,7 @@ def settled(problem: Problem, fitted: Fit) -> Fit:
     return fitted
 
 
-def marginal(problem: Problem, fitted: Fit, *, steps: int = 20) -> np.ndarray:
+def marginal(problem: Problem, fitted: Fit, *, steps: int = 30) -> np.ndarray:
     """Log marginal likelihood of each cluster (cluster,) given the fit's global coordinates.
 
     Local coordinates are looked for over their whole range, refitted per cluster and integrated out by Laplace's method, so
@@ -59,7 +62,13 @@ def marginal(problem: Problem, fitted: Fit, *, steps: int = 20) -> np.ndarray:
 
 
 def own_mode(
-    problem: Problem, active: Active, x: np.ndarray, *, steps: int = 20, tolerance: float = 1e-3
+    problem: Problem,
+    active: Active,
+    x: np.ndarray,
+    *,
+    steps: int = 30,
+    tolerance: float = 1e-3,
+    near: bool = False,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The point with each cluster's own coordinates at their mode given the shared ones, and their curvature there.
 
@@ -67,13 +76,16 @@ def own_mode(
         problem: the model and candidates on their data.
         active: which coordinates are free.
         x: where to start.
-        steps: at most so many Gauss-Newton steps.
+        steps: at most so many; those after the first two take the curvature of the log posterior itself.
         tolerance: stop when the gain that a step promises, in nats per cluster, falls below.
+        near: whether all steps take that curvature, since the mode is near.
     """
     x, terms, damping = x.copy(), cluster_terms(problem, active, x), np.full(problem.n_cluster, _DAMPING)
     own = active.own
-    for _ in range(steps):
-        step = local_step(system_at(problem, own, x), damping)
+    system = system_at(problem, own, x)
+    for number in range(steps):
+        is_exact = near or number >= _SLOW
+        step = local_step(curved(problem, own, x, system) if is_exact else system, damping)
         trial = moved(own, x, step)
         new = cluster_terms(problem, active, trial)
         better = new > terms
@@ -82,4 +94,25 @@ def own_mode(
         damping = np.where(better, damping / 4, damping * 4)
         if step.gain < tolerance * problem.n_cluster:
             break
+        system = rescored(problem, own, x, system) if is_exact else system_at(problem, own, x)
     return x, positive(system_at(problem, own, x).local)
+
+
+def following(
+    problem: Problem, x: np.ndarray, index: Int[np.ndarray, " shared"]
+) -> Float[np.ndarray, "cluster own shared"]:
+    """How the mode of the clusters' own coordinates moves with shared ones, at that mode.
+
+    Args:
+        problem: the model on its data.
+        x: the point.
+        index: positions of the shared coordinates.
+    """
+    own = activate(problem).own
+    local = own.local_index
+    along = np.zeros((len(index), problem.dimension))
+    along[np.arange(len(index)), index] = 1.0
+    everywhere = np.concatenate([basis(problem, own), along])
+    rows = problem.compiled.curvature(x, own.weights, everywhere)[:, local]
+    curvature, cross = (np.moveaxis(part, 0, -1) for part in np.split(rows, [local.shape[1]]))
+    return -np.nan_to_num(np.linalg.solve(positive(np.nan_to_num(curvature)), np.nan_to_num(cross)))

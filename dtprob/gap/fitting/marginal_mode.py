@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, final
 
 import numpy as np
 from jaxtyping import Float, Int
@@ -18,7 +18,7 @@ from jaxtyping import Float, Int
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import Fit, fit
-from dtprob.gap.fitting.marginal import own_mode
+from dtprob.gap.fitting.marginal import following, own_mode
 from dtprob.gap.fitting.plausible import nulls, scales, sides
 from dtprob.gap.fitting.states import held, states, states_mode
 from dtprob.gap.model.problem import Problem
@@ -148,7 +148,7 @@ def height_at(problem: Problem, x: np.ndarray, free: Around) -> tuple[np.ndarray
 
 
 def _inner(
-    problem: Problem, x: np.ndarray, tolerance: float = 1e-3
+    problem: Problem, x: np.ndarray, tolerance: float = 1e-3, *, near: bool = False
 ) -> tuple[np.ndarray, Float[np.ndarray, " cluster"]]:
     """The point with what is integrated out, states or the clusters' own unknowns, at its mode, and V_c there."""
     bare = problem.with_volume(None)
@@ -157,24 +157,43 @@ def _inner(
         x, curvature = states_mode(bare, shared_states, x, tolerance=tolerance)
         volume = -0.5 * np.linalg.slogdet(curvature)[1]
         return x, np.full(problem.n_cluster, volume / problem.n_cluster)
-    x, local = own_mode(bare, activate(bare), x, tolerance=tolerance)
+    x, local = own_mode(bare, activate(bare), x, tolerance=tolerance, near=near)
     return x, -0.5 * np.linalg.slogdet(local)[1]
 
 
-def _volume_at(problem: Problem, x: np.ndarray, index: np.ndarray, move: np.ndarray) -> np.ndarray:
-    """V_c (cluster,) where fitted coordinates are moved from a point, what is integrated out following."""
-    moved = x.copy()
-    moved[index] += move
-    return _inner(problem, moved, _EXACT)[1]
+@final
+class _Volumes:
+    """V_c (cluster,) where fitted coordinates are moved from a point, what is integrated out following.
+
+    Args:
+        problem: whose volume it is.
+        x: the point.
+        index: positions of the fitted coordinates.
+    """
+
+    def __init__(self, problem: Problem, x: np.ndarray, index: Int[np.ndarray, " shared"]) -> None:
+        self._problem, self._index = problem, index
+        self._x, self.here = _inner(problem, x, _EXACT)
+        own, is_own = activate(problem).local_index, not states(problem).blocks
+        self._own = own if is_own else own[:, :0]
+        self._follow = following(problem, self._x, index) if is_own else None
+
+    def __call__(self, move: Float[np.ndarray, " shared"]) -> Float[np.ndarray, " cluster"]:
+        moved = self._x.copy()
+        moved[self._index] += move
+        if self._follow is not None:
+            moved[self._own] += self._follow @ move
+        return _inner(self._problem, moved, _EXACT, near=True)[1]
+
+    def beside(self, step: Float[np.ndarray, " shared"]) -> tuple[np.ndarray, np.ndarray]:
+        """V_c (cluster, shared) a step up and a step down each coordinate."""
+        up, down = (np.stack([self(sign * unit) for unit in np.diag(step)], axis=1) for sign in (1.0, -1.0))
+        return up, down
 
 
 def beside(problem: Problem, x: np.ndarray, free: Around, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """V_c (cluster, shared) a step up and a step down each fitted coordinate."""
-    up, down = (
-        np.stack([_volume_at(problem, x, free.index, sign * unit) for unit in np.diag(step)], axis=1)
-        for sign in (1.0, -1.0)
-    )
-    return up, down
+    return _Volumes(problem, x, free.index).beside(step)
 
 
 def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
@@ -185,13 +204,13 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
     step, at = STEP * free.scale, x.copy()
     at[free.index] = np.maximum(x[free.index], free.lowest + step)
     n, units = len(step), np.diag(step)
-    middle = _volume_at(problem, at, free.index, np.zeros(n))
-    up, down = beside(problem, at, free, step)
+    volumes = _Volumes(problem, at, free.index)
+    middle, (up, down) = volumes.here, volumes.beside(step)
     slope = (up - down) / 2
     bend = (up + down - 2 * middle[:, None])[:, :, None] * np.eye(n)
     straight = np.abs(np.nan_to_num(up + down - 2 * middle[:, None], posinf=0.0, neginf=0.0)).sum(axis=0)
     for i, j in combinations(_bent(problem, x, free, straight / step**2) if n <= _DENSE else (), 2):
-        both = sum(_volume_at(problem, at, free.index, sign * (units[i] + units[j])) for sign in (1.0, -1.0))
+        both = sum(volumes(sign * (units[i] + units[j])) for sign in (1.0, -1.0))
         bend[:, i, j] = bend[:, j, i] = both / 2 - middle - (bend[:, i, i] + bend[:, j, j]) / 2
     value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
     values, vectors = np.linalg.eigh(bend)

@@ -111,6 +111,29 @@ class Compiled:
         return lambda x, weights: np.asarray(slope(jnp.asarray(x), jnp.asarray(weights), self.arrays))
 
     @cached_property
+    def curvature(self) -> Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]:
+        """(x, weights (cluster,), basis (k, dimension)) -> minus the Hessian of the log posterior times the basis.
+
+        Weights are those of what clusters add to it.
+        """
+
+        @jax.jit
+        def curvature(x: Any, weights: Any, basis: jax.Array, arrays: Arrays) -> jax.Array:
+            def total(y: Any) -> jax.Array:
+                found = self.terms(y, arrays)
+                own = jnp.where(weights > 0, found.likelihood + found.local, 0.0)
+                return found.prior + jnp.sum(weights * own)
+
+            return -jax.lax.map(lambda direction: jax.jvp(jax.grad(total), (x,), (direction,))[1], basis)
+
+        def chunked(x: np.ndarray, weights: np.ndarray, basis: np.ndarray) -> np.ndarray:
+            given = jnp.asarray(x), jnp.asarray(weights, float)
+            parts = [np.asarray(curvature(*given, chunk, self.arrays)) for chunk in _chunks(basis)]
+            return np.concatenate(parts)[: len(basis)]
+
+        return chunked
+
+    @cached_property
     def linearised(self) -> Callable[[np.ndarray, np.ndarray], tuple[jax.Array, jax.Array]]:
         """(x, basis (k, dimension)) -> whitened residuals (cluster, row) and tangents (cluster, row, k)."""
 
