@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from typing import Any, Final
 
 import jax
@@ -14,6 +15,7 @@ from dtprob.gap.diagnosis import Cause
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.active import activate, basis, own_basis
 from dtprob.gap.fitting.fit import Fit, fit
+from dtprob.gap.fitting.projection import project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design import Design, Prediction, Ranked, joined, rank, recommend
 from dtprob.gap.observation import whiten
@@ -82,12 +84,12 @@ def designs_of(there: Problem, here: Problem, fits: Sequence[Fit], name: str) ->
         fits: of the rivals.
         name: of the data.
     """
-    points = [there.translate(fitted.x, here) for fitted in fits]
-    origin = there.compiled.observations(points[0])
-    means = [_shift(there, origin, there.compiled.observations(x)) for x in points]
-    columns = [_columns(there, fitted, x) for fitted, x in zip(fits, points, strict=True)]
+    moved = [replace(fitted, x=there.translate(fitted.x, here)) for fitted in fits]
+    origin = there.compiled.observations(moved[0].x)
+    columns = [_columns(there, fitted) for fitted in moved]
     _check_parameters(there, fits, name)
-    whitened = _whitening(there, fits[0], points[0], columns[0][1])
+    means = [_mean(there, fitted, origin, own) for fitted, (_, own) in zip(moved, columns, strict=True)]
+    whitened = _whitening(there, moved[0], columns[0][1])
     rivals = [
         (whitened(mean[..., None])[..., 0], whitened(tangents), fitted.covariance)
         for mean, (tangents, _), fitted in zip(means, columns, fits, strict=True)
@@ -138,6 +140,22 @@ def _label(problem: Problem, cluster: int) -> Any:
     return names[cluster].item() if 1 < len(names) == problem.n_cluster < len(column) else cluster
 
 
+def _mean(
+    problem: Problem,
+    fitted: Fit,
+    origin: Mapping[str, whiten.Observation],
+    own: Float[np.ndarray, "cluster row local"],
+) -> Float[np.ndarray, "cluster row"]:
+    """Whitened rows that a fit predicts, from an origin, with clusters' own coordinates at the centre of their prior.
+
+    What the data so far tell of these is nothing that new rows have: they are drawn anew.
+    """
+    rows = _shift(problem, origin, problem.compiled.observations(fitted.x))
+    if not own.shape[-1]:
+        return rows
+    return rows - np.einsum("cml,cl->cm", own, project(problem, fitted).own.deviation)
+
+
 def _shift(
     problem: Problem, origin: Mapping[str, whiten.Observation], other: Mapping[str, whiten.Observation]
 ) -> Float[np.ndarray, "cluster row"]:
@@ -149,22 +167,22 @@ def _shift(
     return np.asarray(problem.rows.stack(rows))
 
 
-def _columns(problem: Problem, fitted: Fit, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _columns(problem: Problem, fitted: Fit) -> tuple[np.ndarray, np.ndarray]:
     """Whitened tangents of the global and of the clusters' own coordinates, (cluster, row, coordinate)."""
     active = activate(problem, fitted.effects)
-    columns = np.asarray(problem.compiled.linearised(x, basis(problem, active))[1])
+    columns = np.asarray(problem.compiled.linearised(fitted.x, basis(problem, active))[1])
     return columns[..., : len(active.global_index)], columns[..., len(active.global_index) :]
 
 
 def _whitening(
-    problem: Problem, fitted: Fit, x: np.ndarray, own: Float[np.ndarray, "cluster row local"]
+    problem: Problem, fitted: Fit, own: Float[np.ndarray, "cluster row local"]
 ) -> Callable[[np.ndarray], np.ndarray]:
     """What makes rows (cluster, row, any) independent once clusters' own coordinates are integrated over their prior."""
     active = activate(problem, fitted.effects)
     directions = own_basis(problem, active)
     if not len(directions):
         return lambda rows: rows
-    curvature = problem.compiled.prior(x, directions)[1]
+    curvature = problem.compiled.prior(fitted.x, directions)[1]
     precision = np.stack([row[active.local_index[:, j]] for j, row in enumerate(curvature)], axis=-1)
     told = np.einsum("cml,cml->cl", own, own)
     scaled = own / np.sqrt(np.maximum(precision, _LOOSE * np.maximum(told, 1e-300)))[:, None, :]

@@ -97,8 +97,44 @@ def test_a_new_links_own_level_is_known_by_its_prior_only():
     located = first.tangents[np.abs(first.tangents[:, 0]) > 1e-9][:, 0]
     expected = x[2] / SIGMA
     assert located @ located == pytest.approx(expected @ np.linalg.solve(law, expected), rel=1e-6)
-    assert first.mean == pytest.approx(np.zeros(len(first.mean)))
-    assert np.abs(second.mean).max() > 0
+    slopes = [(f.x[problem.layout["b"].index[0, 0]], f.x[f.global_index][-1]) for f in fits]
+    (b, c), (other, d) = slopes
+    apart = ((b - other) * x[2] + c * np.abs(x[2]) ** 2 - d * np.abs(x[2]) ** 3) / SIGMA
+    between = second.mean - first.mean
+    assert between @ between == pytest.approx(apart @ np.linalg.solve(law, apart), rel=1e-6)
+
+
+def flags(flag, z, y=None):
+    """Links whose levels are their own."""
+    with numpyro.plate("link", len(flag), dim=-2):
+        level = numpyro.sample("a", dist.Normal(0.0, 1.0))
+        with numpyro.plate("sample", 6, dim=-1):
+            mean = numpyro.deterministic("mean", level + jnp.zeros((len(flag), 6)))
+            numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+def by(name):
+    return Effect(
+        f"by_{name}",
+        {"mean": lambda v, p, c: v + p["c"] * c[name][:, None]},
+        (Parameter("c", dist.Normal(0.0, 2.0)),),
+        requires=(name,),
+    )
+
+
+def test_levels_that_rivals_fitted_otherwise_do_not_make_a_repeat_useless():
+    rng, z = np.random.default_rng(0), np.linspace(-1, 1, 24)
+    flag = (z > 0.2).astype(float)
+    y = rng.normal(size=(24, 1)) + 3 * flag[:, None] + SIGMA * rng.normal(size=(24, 6))
+    columns, effects = {"flag": flag, "z": z}, (by("flag"), by("z"))
+    problem = Problem(flags, {**columns, "y": jnp.asarray(y)}, effects).with_live(["by_flag", "by_z"])
+    fits = [fitting.fit(problem, problem.null(), [effect.name]) for effect in effects]
+    (a,), (b,) = (fitted.x[fitted.global_index] for fitted in fits)
+    designs = designs_of(problem, problem, fits, "again")
+    for link in (0, 12, 23):
+        first, second = designs[link].predictions
+        expected = np.abs(b * z[link] - a * flag[link]) / np.sqrt(1.0 + SIGMA**2 / 6)
+        assert np.linalg.norm(second.mean - first.mean) == pytest.approx(expected, rel=1e-6)
 
 
 def test_a_diagnosis_recommends_what_splits_its_class():
