@@ -31,11 +31,13 @@ class Prediction(NamedTuple):
         mean: of each row, from an origin that all rivals share.
         tangents: by which it moves with each uncertain parameter.
         covariance: of these parameters, as the data so far leave them.
+        own: tangents of what the design has for itself, of unit variance; None where it has nothing.
     """
 
     mean: Float[np.ndarray, " row"]
     tangents: Float[np.ndarray, "row parameter"]
     covariance: Float[np.ndarray, "parameter parameter"]
+    own: Float[np.ndarray, "row own"] | None = None
 
 
 class Design(NamedTuple):
@@ -145,11 +147,25 @@ def joined(designs: Sequence[Design]) -> Design:
             np.concatenate([part.mean for part in parts]),
             np.concatenate([part.tangents for part in parts]),
             parts[0].covariance,
+            _apart(designs, parts),
         )
         for parts in rivals
     )
     where = _merged([design.where for design in designs])
     return Design(where, sum(design.cost for design in designs), predictions)
+
+
+def _apart(designs: Sequence[Design], parts: Sequence[Prediction]) -> Float[np.ndarray, "row own"] | None:
+    """What each of several designs has for itself, side by side; a design that is made twice has one of it."""
+    pairs = list(zip(designs, parts, strict=True))
+    mine = {id(design): part.own for design, part in pairs if part.own is not None}
+    if not mine:
+        return None
+    rows = [
+        [own if key == id(design) else np.zeros((len(part.mean), own.shape[1])) for key, own in mine.items()]
+        for design, part in pairs
+    ]
+    return np.block(rows)
 
 
 def _merged(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
@@ -190,10 +206,16 @@ def _pairs(predictions: Sequence[Prediction]) -> Iterator[_Pair]:
 
 def _pair(truth: Prediction, rival: Prediction) -> _Pair:
     difference = truth.mean - rival.mean
-    own, other = (each.tangents @ _root(each.covariance) for each in (truth, rival))
+    own, other = (_columns(each) for each in (truth, rival))
     return _Pair(
         float(difference @ difference), other.T @ difference, own.T @ own, other.T @ other, other.T @ own
     )
+
+
+def _columns(one: Prediction) -> Float[np.ndarray, "row parameter"]:
+    """Tangents of parameters of unit variance."""
+    shared = one.tangents @ _root(one.covariance)
+    return shared if one.own is None else np.hstack([shared, one.own])
 
 
 def _root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import jax
 import numpy as np
@@ -88,15 +88,21 @@ def designs_of(there: Problem, here: Problem, fits: Sequence[Fit], name: str) ->
     origin = there.compiled.observations(moved[0].x)
     columns = [_columns(there, fitted) for fitted in moved]
     _check_parameters(there, fits, name)
-    means = [_mean(there, fitted, origin, own) for fitted, (_, own) in zip(moved, columns, strict=True)]
-    whitened = _whitening(there, moved[0], columns[0][1])
+    whitened = _whitening(there, moved[0].x, columns[0].own)
     rivals = [
-        (whitened(mean[..., None])[..., 0], whitened(tangents), fitted.covariance)
-        for mean, (tangents, _), fitted in zip(means, columns, fits, strict=True)
+        (
+            whitened(_mean(there, fitted, origin, of)[..., None])[..., 0],
+            whitened(of.shared),
+            whitened(of.field) if of.field.shape[-1] else None,
+        )
+        for fitted, of in zip(moved, columns, strict=True)
     ]
     designs = []
     for cluster in range(there.n_cluster):
-        predictions = tuple(Prediction(mean[cluster], tangents[cluster], c) for mean, tangents, c in rivals)
+        predictions = tuple(
+            Prediction(mean[cluster], shared[cluster], f.covariance, None if own is None else own[cluster])
+            for (mean, shared, own), f in zip(rivals, fits, strict=True)
+        )
         where = {there.cluster_name: _label(there, cluster)}
         designs.append(Design(where if name == _AGAIN else {"design": name, **where}, 1.0, predictions))
     return designs
@@ -141,19 +147,16 @@ def _label(problem: Problem, cluster: int) -> Any:
 
 
 def _mean(
-    problem: Problem,
-    fitted: Fit,
-    origin: Mapping[str, whiten.Observation],
-    own: Float[np.ndarray, "cluster row local"],
+    problem: Problem, fitted: Fit, origin: Mapping[str, whiten.Observation], columns: _Columns
 ) -> Float[np.ndarray, "cluster row"]:
     """Whitened rows that a fit predicts, from an origin, with clusters' own coordinates at the centre of their prior.
 
     What the data so far tell of these is nothing that new rows have: they are drawn anew.
     """
     rows = _shift(problem, origin, problem.compiled.observations(fitted.x))
-    if not own.shape[-1]:
+    if not columns.local.shape[-1]:
         return rows
-    return rows - np.einsum("cml,cl->cm", own, project(problem, fitted).own.deviation)
+    return rows - np.einsum("cml,cl->cm", columns.local, project(problem, fitted).own.deviation)
 
 
 def _shift(
@@ -167,22 +170,54 @@ def _shift(
     return np.asarray(problem.rows.stack(rows))
 
 
-def _columns(problem: Problem, fitted: Fit) -> tuple[np.ndarray, np.ndarray]:
-    """Whitened tangents of the global and of the clusters' own coordinates, (cluster, row, coordinate)."""
-    active = activate(problem, fitted.effects)
+class _Columns(NamedTuple):
+    """Whitened tangents (cluster, row, coordinate) of a fit's coordinates.
+
+    Attributes:
+        shared: of the global ones.
+        local: of those that clusters have of their own.
+        is_field: which of these are a random field's.
+        deviation: standard deviations of the fields' ones.
+    """
+
+    shared: np.ndarray
+    local: np.ndarray
+    is_field: np.ndarray
+    deviation: np.ndarray
+
+    @property
+    def own(self) -> np.ndarray:
+        """Of the base model's own ones, which all rivals have."""
+        return self.local[..., ~self.is_field]
+
+    @property
+    def field(self) -> np.ndarray:
+        """Of the fields' ones, of unit variance."""
+        return self.local[..., self.is_field] * self.deviation
+
+
+def _columns(problem: Problem, fitted: Fit) -> _Columns:
+    active = activate(problem, fitted.effects, spread=fitted.spread)
     columns = np.asarray(problem.compiled.linearised(fitted.x, basis(problem, active))[1])
-    return columns[..., : len(active.global_index)], columns[..., len(active.global_index) :]
+    n = len(active.global_index)
+    owners = [b.owner for b in active.blocks if b.local for _ in range(b.size)]
+    deviation = np.array([active.spread[owner] for owner in owners if owner is not None])
+    is_field = np.array([owner is not None for owner in owners], bool)
+    return _Columns(columns[..., :n], columns[..., n:], is_field, deviation)
 
 
 def _whitening(
-    problem: Problem, fitted: Fit, own: Float[np.ndarray, "cluster row local"]
+    problem: Problem, x: np.ndarray, own: Float[np.ndarray, "cluster row local"]
 ) -> Callable[[np.ndarray], np.ndarray]:
-    """What makes rows (cluster, row, any) independent once clusters' own coordinates are integrated over their prior."""
-    active = activate(problem, fitted.effects)
+    """What makes rows (cluster, row, any) independent once clusters' own coordinates are integrated over their prior.
+
+    Of the base model's only, which all rivals have: a field is one rival's, and part of what it predicts.
+    """
+    active = activate(problem)
     directions = own_basis(problem, active)
     if not len(directions):
         return lambda rows: rows
-    curvature = problem.compiled.prior(fitted.x, directions)[1]
+    curvature = problem.compiled.prior(x, directions)[1]
     precision = np.stack([row[active.local_index[:, j]] for j, row in enumerate(curvature)], axis=-1)
     told = np.einsum("cml,cml->cl", own, own)
     scaled = own / np.sqrt(np.maximum(precision, _LOOSE * np.maximum(told, 1e-300)))[:, None, :]

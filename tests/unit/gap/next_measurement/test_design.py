@@ -98,6 +98,20 @@ def test_repeats_do_not_tell_apart_what_a_nuisance_hides_but_another_place_does(
     assert resolution([*joined([first, second]).predictions]) == pytest.approx(9.0, rel=0.02)
 
 
+def test_what_a_place_has_for_itself_is_shared_by_what_is_measured_there_only():
+    """A level of each place, of variance v: a place joined with itself is one that is measured twice."""
+    v, none = 4.0, (np.zeros((1, 0)), np.zeros((0, 0)))
+    level = np.full((1, 1), v**0.5)
+    first, second = (
+        Design({"row": k}, 1.0, tuple(Prediction(np.array([m]), *none, level) for m in (0.0, 3.0)))
+        for k in range(2)
+    )
+    twice = resolution(first.predictions, repeats=2)
+    assert twice == pytest.approx(0.5 * 9 * 2 / (1 + 2 * v))
+    assert resolution(joined([first, first]).predictions) == pytest.approx(twice)
+    assert resolution(joined([first, second]).predictions) == pytest.approx(2 * resolution(first.predictions))
+
+
 def test_a_plan_of_one_place_is_the_first_of_the_ranking():
     none = np.zeros((1, 0)), np.zeros((0, 0))
     designs = [

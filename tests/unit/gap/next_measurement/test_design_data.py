@@ -7,12 +7,12 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.effects.effect import Effect, Parameter
+from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.next_measurement.design import rank
+from dtprob.gap.next_measurement.design import expected_evidence, joined, rank
 from dtprob.gap.next_measurement.design_data import designs_of
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
@@ -135,6 +135,61 @@ def test_levels_that_rivals_fitted_otherwise_do_not_make_a_repeat_useless():
         first, second = designs[link].predictions
         expected = np.abs(b * z[link] - a * flag[link]) / np.sqrt(1.0 + SIGMA**2 / 6)
         assert np.linalg.norm(second.mean - first.mean) == pytest.approx(expected, rel=1e-6)
+
+
+def slope_alone(x, y=None):
+    """A line through the origin on links."""
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("link", x.shape[0], dim=-2), numpyro.plate("sample", x.shape[1], dim=-1):
+        mean = numpyro.deterministic("mean", slope * x)
+        numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
+
+
+LEVELS = Effect(
+    "levels",
+    {"mean": lambda v, p, c: v + p["s"] * p[FIELD]},
+    (Parameter("s", dist.HalfNormal(1.0)),),
+    kind="variance",
+    field_shape=lambda v, _: (v.shape[0], 1),
+)
+
+
+def divergence(truth, rival):
+    """Of two normal laws, mean and covariance of each."""
+    (m, s), (other, v) = truth, rival
+    inverse, d = np.linalg.inv(v), m - other
+    logs = np.linalg.slogdet(v)[1] - np.linalg.slogdet(s)[1]
+    return 0.5 * (np.trace(inverse @ s) - len(d) + d @ inverse @ d + logs)
+
+
+@pytest.mark.parametrize("order", [(0, 1), (1, 0)])
+def test_a_random_field_is_part_of_what_its_rival_predicts_whichever_comes_first(order):
+    rng = np.random.default_rng(1)
+    x = rng.normal(size=(20, 6))
+    y = x + 0.6 * rng.normal(size=(20, 1)) + 0.2 * x**2 + SIGMA * rng.normal(size=x.shape)
+    effects = (bend(2), LEVELS)
+    problem = Problem(slope_alone, {"x": jnp.asarray(x), "y": jnp.asarray(y)}, effects)
+    problem = problem.with_live([effect.name for effect in effects])
+    fits = [fitting.fit(problem, problem.null(), [effect.name]) for effect in effects]
+    designs = designs_of(problem, problem, [fits[k] for k in order], "again")
+
+    def laws(links):
+        """Of a bend's rows and of those that have levels, at some links."""
+        flat = x[links].reshape(-1)
+        columns = np.column_stack([flat, flat**2]), flat[:, None]
+        noise = SIGMA**2 * np.eye(len(flat))
+        level = fits[1].spread["levels"] ** 2 * np.kron(np.eye(len(links)), np.ones((6, 6)))
+        return [
+            (m @ f.x[f.global_index], noise + m @ f.covariance @ m.T + more)
+            for m, f, more in zip(columns, fits, (0.0, level), strict=True)
+        ]
+
+    for links in ([0], [5], [0, 5]):
+        found = joined([designs[link] for link in links]).predictions
+        expected = laws(links)
+        for truth, rival in ((0, 1), (1, 0)):
+            nats = expected_evidence(found[order.index(truth)], found[order.index(rival)])
+            assert nats == pytest.approx(divergence(expected[truth], expected[rival]), rel=1e-5)
 
 
 def test_a_diagnosis_recommends_what_splits_its_class():
