@@ -32,10 +32,7 @@ def maps(evidence: Evidence, closed: Mapping[str, ClosedShare]) -> dict[str, xr.
         where[f"closed_{axis}"] = (axis, share.found, {"nats": share.total})
         where[f"closed_expected_{axis}"] = (axis, share.expected)
     problem, name = evidence.problem, evidence.problem.cluster_name
-    per = (
-        np.maximum((problem.rows.by_cluster(problem.rows.located) >= 0).sum(1), 1)
-        / problem.rows_per_observation
-    )
+    per = np.maximum(problem.n_observation_of_each, 1.0)
     entropy = -evidence.floor.best / problem.n_observation
     clusters: dict[str, Any] = {
         "before": (name, -evidence.held_before.log_likelihood / per - entropy),

@@ -35,7 +35,7 @@ class Calibration:
     """Predicted against actual errors, on clusters that were left out; None where they refit all that they show.
 
     Attributes:
-        coverage: share of observed entries inside their 90% predictive interval; None where not all are normal.
+        coverage: share of observed entries that count inside their 90% predictive interval; None where not all are normal.
         error_ratio: root mean square of errors over predicted standard deviations, 1 if they are right; None where outcomes
             are observed. The probability p of an outcome says how much it varies, p (1 - p), however uncertain p itself is:
             outcomes one by one vary no more where a gap is, and no less than predicted once it is allowed for (McCullagh
@@ -53,7 +53,8 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
         problem: on whose data the fits were made.
         folds: which clusters were left out, and the fits to the others.
     """
-    located = problem.rows.by_cluster(problem.rows.located) == 1
+    counted = problem.in_rows(problem.counted) > 0
+    located = counted & (problem.rows.by_cluster(problem.rows.located) == 1)
     inside, squares = [], []
     families: set[str] = set()
     for held, part, _ in folds:

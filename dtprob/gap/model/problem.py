@@ -29,7 +29,7 @@ from dtprob.gap.model.own import Own
 from dtprob.gap.model.prior import Prior
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
-from dtprob.gap.model.responses import responses
+from dtprob.gap.model.responses import counted, responses
 from dtprob.gap.model.rows import Rows, make_rows
 from dtprob.gap.model.running import Arrays, Runner
 from dtprob.gap.model.shapes import latent_shapes, observed_shapes, perturbed_sites, shapes_of_fields
@@ -244,10 +244,22 @@ class Problem:
         """Length of the flat vector."""
         return self.layout.dimension
 
+    @cached_property
+    def counted(self) -> dict[str, np.ndarray]:
+        """Which entries of each observed site no mask leaves out."""
+        return counted(self._declared, self.arrays)
+
     @property
     def n_observation(self) -> int:
-        """Observed entries, a complex one counted once."""
-        return sum(site.size for site in self.declaration.observed.values())
+        """Observed entries that count, a complex one once."""
+        return sum(int(entries.sum()) for entries in self.counted.values())
+
+    def in_rows(self, entries: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Entries of each observed site (*site) as rows (cluster, row), the same in each of their rows."""
+        count = self.components
+        return np.asarray(
+            self.rows.stack({n: jnp.asarray(np.stack([entries[n]] * k)) for n, k in count.items()})
+        )
 
     @property
     def components(self) -> dict[str, int]:
@@ -275,9 +287,9 @@ class Problem:
         return set(self.families.values()) == {"LogNormal"}
 
     @property
-    def rows_per_observation(self) -> float:
-        """Whitened rows per observed entry."""
-        return len(self.rows.ids) / max(self.n_observation, 1)
+    def n_observation_of_each(self) -> np.ndarray:
+        """Observed entries of each cluster that count (cluster,)."""
+        return self.in_rows({n: self.counted[n] / k for n, k in self.components.items()}).sum(1)
 
     @cached_property
     def responses(self) -> frozenset[str]:

@@ -1,4 +1,4 @@
-"""Which arguments of a model tell what was observed, so that they explain nothing."""
+"""Which arguments of a model tell what was observed, so that they explain nothing, and which entries of it count."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Bool
 
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.quick import quick_jit
@@ -38,3 +39,20 @@ def responses(declared: Declared, arrays: Any) -> frozenset[str]:
             if any(not np.array_equal(a, b) for a, b in zip(after, before, strict=True)):
                 found.add(name)
     return frozenset(found)
+
+
+def counted(declared: Declared, arrays: Any) -> dict[str, Bool[np.ndarray, "*site"]]:
+    """Which entries of each observed site count: all that its mask, if it has one, does not leave out.
+
+    Args:
+        declared: the model.
+        arrays: its arguments that are arrays, by name.
+    """
+
+    @quick_jit
+    def masks(arrays: Any) -> dict[str, Any]:
+        found = observations(declared.declaration, declared.trace(arrays))
+        return {n: o.parameters["mask"] for n, o in found.items() if "mask" in o.parameters}
+
+    found, sites = masks(arrays), declared.declaration.observed
+    return {n: np.broadcast_to(np.asarray(found.get(n, 1.0)) > 0, site.shape) for n, site in sites.items()}

@@ -293,6 +293,28 @@ def test_predictions_of_a_right_model_are_calibrated():
     assert found.error_ratio == pytest.approx(1.0, abs=3.5 / np.sqrt(2 * N_ROW))
 
 
+def holed(x, seen, y=None):
+    """A line with known noise, of which some readings are masked."""
+    slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
+    with numpyro.plate("link", x.shape[0], dim=-2), numpyro.plate("sample", x.shape[1], dim=-1):
+        numpyro.sample("y", dist.Normal(slope * x, SIGMA).mask(seen), obs=y)
+
+
+def test_masked_readings_are_no_hits():
+    """The noise is twice what the model says, which four readings in five are not there to tell."""
+    rng = np.random.default_rng(0)
+    x, seen = rng.normal(size=(40, 30)), rng.random((40, 30)) < 0.2
+    y = 2 * x + 2 * SIGMA * rng.normal(size=x.shape)
+    problem = Problem(holed, {"x": jnp.asarray(x), "seen": jnp.asarray(seen), "y": jnp.asarray(y)}, ())
+    fitted = fitting.fit(problem, problem.null())
+    found = calibration(problem, list(closed.fold_fits(problem, fitted, closed.folds(40, 4))))
+    scaled = ((y - fitted.x[0] * x) / SIGMA)[seen]
+    assert problem.n_observation == seen.sum()
+    np.testing.assert_allclose(problem.n_observation_of_each, seen.sum(1))
+    assert found.coverage == pytest.approx(np.mean(np.abs(scaled) < 1.645), abs=0.02)
+    assert found.error_ratio == pytest.approx(np.sqrt(np.mean(scaled**2)), rel=0.02)
+
+
 @pytest.mark.parametrize("name", ["counts", "logistic", "labels"])
 def test_errors_of_outcomes_are_not_judged(name):
     """A level of each link's own: counts vary more with it, outcomes by p (1 - p) as before."""
