@@ -9,6 +9,7 @@ import numpy as np
 import xarray as xr
 
 from dtprob.gap.evidence import Evidence
+from dtprob.gap.how_far.expected import expected_loss
 from dtprob.gap.where.closed_share import ClosedShare
 
 _PATHS = "path_gain"
@@ -32,11 +33,11 @@ def maps(evidence: Evidence, closed: Mapping[str, ClosedShare]) -> dict[str, xr.
         where[f"closed_{axis}"] = (axis, share.found, {"nats": share.total})
         where[f"closed_expected_{axis}"] = (axis, share.expected)
     problem, name = evidence.problem, evidence.problem.cluster_name
-    per = np.maximum(problem.n_observation_of_each, 1.0)
-    entropy = -evidence.floor.best / problem.n_observation
+    per, least = np.maximum(problem.n_observation_of_each, 1.0), _floor(evidence)
     clusters: dict[str, Any] = {
-        "before": (name, -evidence.held_before.log_likelihood / per - entropy),
-        "after": (name, -evidence.held_after.log_likelihood / per - entropy),
+        "before": (name, -evidence.held_before.log_likelihood / per - least),
+        "after": (name, -evidence.held_after.log_likelihood / per - least),
+        "floor": (name, least),
     }
     for entry in problem.data.values():
         for position in ("rx_position", "tx_position"):
@@ -56,11 +57,21 @@ def maps(evidence: Evidence, closed: Mapping[str, ClosedShare]) -> dict[str, xr.
     group = "links" if name == "link" else "clusters"
     return {
         "where": xr.Dataset({**where, **after}),
-        group: xr.Dataset(clusters, attrs={"floor": entropy}),
+        group: xr.Dataset(clusters),
         "screening": screening,
         **_differences(evidence),
         **_paths(evidence),
     }
+
+
+def _floor(evidence: Evidence) -> np.ndarray:
+    """Nats per observation below which no cluster is expected to come (cluster,), all together at the floor of the whole.
+
+    Noise that is known to be larger in one cluster is no gap there.
+    """
+    count = np.maximum(evidence.problem.n_observation_of_each, 1.0)
+    expected = expected_loss(evidence.last.problem, evidence.fitted.x)
+    return expected / count - (evidence.floor.best + expected.sum()) / count.sum()
 
 
 def _differences(evidence: Evidence) -> dict[str, xr.Dataset]:

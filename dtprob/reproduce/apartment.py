@@ -141,8 +141,8 @@ def answer(
         reached = _numbers(prepared.case.data.file, prepared.data["paths"])
     links = found.maps["links"]
     per_link = prepared.data["power"][0].size
-    before = per_link * (np.asarray(links["before"]) + links.attrs["floor"])
-    after = per_link * (np.asarray(links["after"]) + links.attrs["floor"]) if found.causes else before
+    before = per_link * np.asarray(links["before"] + links["floor"])
+    after = per_link * np.asarray(links["after"] + links["floor"]) if found.causes else before
     cause = found.causes[0] if found.causes else None
     inside = () if cause is None else tuple(names[-1] for names in cause.alias_class)
     named = "" if cause is None else cause.effects[0]

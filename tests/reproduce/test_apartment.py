@@ -198,9 +198,8 @@ def test_losses_are_counted_in_nats_of_a_link(measured, monkeypatch):
     def diagnosed(prepared, key, settings, say):
         del key, settings, say
         n = prepared.data["power"].shape[0]
-        links = xr.Dataset(
-            {"before": ("link", np.full(n, 3.0)), "after": ("link", np.full(n, 2.0))}, attrs={"floor": -1.0}
-        )
+        levels = {"before": 3.0, "after": 2.0, "floor": -1.0}
+        links = xr.Dataset({name: ("link", np.full(n, level)) for name, level in levels.items()})
         return SimpleNamespace(maps={"links": links}, causes=(), verdict="NO_GAP")
 
     monkeypatch.setattr(apartment, "_diagnosed", diagnosed)
