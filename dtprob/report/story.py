@@ -27,6 +27,9 @@ from dtprob.report.names import (
 )
 from dtprob.report.units import DASH, percent
 
+_MUCH = 1.5
+"""Times as much that everything again costs from which that is told."""
+
 
 @dataclass(frozen=True)
 class Story:
@@ -70,6 +73,8 @@ def next_step(report: Report) -> str | None:
     if not plan.get("resolves", True):
         return f"No measurement that is known of tells the explanations apart, however often made; {place} comes nearest."
     times = plan.get("repeats", 1)
+    if plan.get("everything"):
+        return f"Measure everything again{f' {times} times' * (times > 1)}: no few places decide for less."
     each = " each" * any(isinstance(value, list | tuple) and len(value) > 1 for value in where.values())
     many = f" {times} times{each}" if times > 1 else ""
     again = "" if offered else " again"
@@ -105,13 +110,14 @@ def changed(sites: Sequence[Site]) -> str:
 
 
 def _saved(plan: Mapping[str, Any]) -> str:
-    """How much less that costs than everything again."""
+    """How much less that costs than everything again, where that is much."""
     everything = plan.get("cost_of_all_again")
     if "cost" not in plan:
         return ""
     if everything is None:
         return " Measuring everything again would not decide."
-    return f" Everything again would cost {everything / plan['cost']:.0f} times as much."
+    times = everything / plan["cost"]
+    return f" Everything again would cost {times:.0f} times as much." if times >= _MUCH else ""
 
 
 def tell(report: Report) -> Story:

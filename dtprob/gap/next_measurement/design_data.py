@@ -27,6 +27,8 @@ _SHOWN: Final = 5
 """Designs that a report lists."""
 _LOOSE: Final = 1e-6
 """Prior precision of a cluster's own coordinate, at least, as a share of what its rows tell of it."""
+_MOST_ENTRIES: Final = 2e7
+"""Of the tangents of all clusters' fields together."""
 _AGAIN: Final = "again"
 """Name of the data that are there, measured once more."""
 
@@ -43,8 +45,8 @@ def next_measurement(
             beside those that are there, measured again. Observed values in them are not looked at.
 
     Returns:
-        For report.json: the classes, the recommended designs with their repeats and what they bring, what the same costs by
-        repeating everything, and the best single designs in order.
+        For report.json: the classes, the recommended designs with their repeats and what they bring, whether they are all
+        that is there, as nothing less decides for less, what repeating that costs, and the best single designs in order.
     """
     if not causes or len(causes[0].alias_class) < 2:
         return None
@@ -55,18 +57,44 @@ def next_measurement(
     candidates = list(again)
     for name, data in designs.items():
         candidates += designs_of(_problem_at(here, data), here, fits, name)
-    everything = rank([joined(again)])[0]
-    best = recommend(candidates)
+    whole = everything(again)
+    best = cheapest(candidates, whole)
     return {
         "split": [list(names) for names in causes[0].alias_class],
         "design": dict(best.where),
         "repeats": best.repeats,
         "gain_nats": best.nats,
         "resolves": best.resolves,
+        "everything": best is whole,
         "cost": best.cost,
-        "cost_of_all_again": everything.cost if everything.resolves else None,
+        "cost_of_all_again": None if whole is None else whole.cost,
         "ranking": [_line(one) for one in rank(candidates)[:_SHOWN]],
     }
+
+
+def everything(again: Sequence[Design]) -> Ranked | None:
+    """All that is there, made again as often as decides; None where that never does, or there are too many fields to hold.
+
+    Args:
+        again: the clusters, each measured again.
+    """
+    first = again[0].predictions
+    rows, fields = len(first[0].mean), max(0 if p.own is None else p.own.shape[1] for p in first)
+    if len(again) ** 2 * rows * fields > _MOST_ENTRIES:
+        return None
+    found = rank([joined(again)])[0]
+    return found if found.resolves else None
+
+
+def cheapest(candidates: Sequence[Design], whole: Ranked | None) -> Ranked:
+    """The plan of a few designs, or the whole where no such plan costs less.
+
+    Args:
+        candidates: the designs.
+        whole: everything again, if that decides.
+    """
+    few = recommend(candidates)
+    return few if whole is None or (few.resolves and few.cost <= whole.cost) else whole
 
 
 def _moved(here: Problem, at: Start) -> Fit:

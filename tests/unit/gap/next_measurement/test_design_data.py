@@ -12,8 +12,8 @@ from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.next_measurement.design import expected_evidence, joined, rank
-from dtprob.gap.next_measurement.design_data import designs_of
+from dtprob.gap.next_measurement.design import Design, Prediction, expected_evidence, joined, rank, recommend
+from dtprob.gap.next_measurement.design_data import cheapest, designs_of, everything
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
 
@@ -214,6 +214,29 @@ def test_a_diagnosis_recommends_what_splits_its_class():
     after = diagnose(line, both, EFFECTS, **options)
     assert after.verdict == "LISTED"
     assert after.causes[0].effects == ("bend_2",)
+
+
+def test_everything_again_is_a_plan_where_no_few_places_cost_less():
+    """Unknown levels of 40 sites hide the same difference at each: a few sites never tell, all do at once."""
+    levels = np.eye(40)
+
+    def at(site, mean):
+        return Prediction(np.array([mean]), levels[[site]], levels)
+
+    gap = np.sqrt(1.525)
+    again = [Design({"site": k}, 1.0, (at(k, 0.0), at(k, gap))) for k in range(40)]
+    whole = everything(again)
+    assert whole.cost == 40.0
+    assert cheapest(again, whole) is whole
+    few = recommend(again)
+    assert few.cost > whole.cost
+    assert cheapest(again, None) == few
+    none = np.zeros((1, 0)), np.zeros((0, 0))
+    plain = [
+        Design({"site": k}, 1.0, tuple(Prediction(np.array([m]), *none) for m in (0.0, 3.0)))
+        for k in range(4)
+    ]
+    assert cheapest(plain, everything(plain)).cost == 1.0
 
 
 def many(x, group, y=None):
