@@ -168,10 +168,15 @@ def _check_parameters(there: Problem, fits: Sequence[Fit], name: str) -> None:
 
 
 def _label(problem: Problem, cluster: int) -> Any:
-    """What the user calls a cluster: the entry of its column, or its number."""
+    """What the user calls a cluster: the entry of its column, or its number.
+
+    Where all entries differ, clusters are in their order.
+    """
     column = np.asarray(problem.data.get(problem.cluster_name, 0))
     names = np.unique(column)
-    return names[cluster].item() if 1 < len(names) == problem.n_cluster < len(column) else cluster
+    if column.ndim != 1 or len(names) != problem.n_cluster:
+        return cluster
+    return (column if len(names) == len(column) else names)[cluster].item()
 
 
 def _mean(

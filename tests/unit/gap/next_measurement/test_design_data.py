@@ -74,6 +74,29 @@ def test_predictions_are_those_of_a_linear_model():
     assert rank(designs)[0].where["row"] in {0, 2}
 
 
+def streets(x, street, y=None):
+    """The line over rows of streets."""
+    del street
+    line(x, y)
+
+
+@pytest.mark.parametrize(
+    ("ids", "called"), [([207, 105, 311], [207, 105, 311]), ([207, 105, 311, 311], [105, 207, 311])]
+)
+def test_a_cluster_is_called_by_its_entry_however_often_that_is_there(ids, called):
+    def rows(ids):
+        x = np.linspace(1, 2, len(ids))
+        return {**data(x, 2, 0), "street": jnp.asarray(ids)}
+
+    names = [effect.name for effect in EFFECTS]
+    here, there = (
+        Problem(streets, rows(k), EFFECTS, "street").with_live(names)
+        for k in (np.repeat([11, 12, 13, 14], 5), ids)
+    )
+    fits = [fitting.fit(here, here.null(), [name]) for name in names]
+    assert [one.where["street"] for one in designs_of(there, here, fits, "elsewhere")] == called
+
+
 def hierarchy(x, y=None):
     """A line on links whose levels are their own."""
     slope = numpyro.sample("b", dist.Normal(0.0, 3.0))
