@@ -72,14 +72,42 @@ class Ranked(NamedTuple):
     resolves: bool
 
 
+class _Law(NamedTuple):
+    """A rival's prediction, N(mean, I + U U').
+
+    Attributes:
+        mean: of each row.
+        tangents: U, of parameters of unit variance.
+        directions: singular vectors of U (row, k).
+        sizes: of which U U' has these eigenvalues (k,).
+    """
+
+    mean: Float[np.ndarray, " row"]
+    tangents: Float[np.ndarray, "row parameter"]
+    directions: Float[np.ndarray, "row k"]
+    sizes: Float[np.ndarray, " k"]
+
+
 class _Pair(NamedTuple):
-    """Inner products of two rivals' predictions, which grow in proportion with repeats."""
+    """Two rivals' predictions along the other's directions, all of which grows in proportion with repeats.
+
+    Attributes:
+        distance: square of what lies between their means.
+        along: squares of that along each direction (k,).
+        cross: squares of the true one's tangents along each (k,).
+        own: eigenvalues of the true one's covariance.
+        other: of the other's (k,).
+    """
 
     distance: float
-    slope: np.ndarray
-    own: np.ndarray
-    other: np.ndarray
-    cross: np.ndarray
+    along: Float[np.ndarray, " k"]
+    cross: Float[np.ndarray, " k"]
+    own: Float[np.ndarray, " j"]
+    other: Float[np.ndarray, " k"]
+
+
+type _Roots = Mapping[int, Float[np.ndarray, "n n"]]
+"""Square roots of rivals' covariances, by the identity of each: all designs share them."""
 
 
 def expected_evidence(truth: Prediction, rival: Prediction, repeats: int = 1) -> float:
@@ -90,12 +118,12 @@ def expected_evidence(truth: Prediction, rival: Prediction, repeats: int = 1) ->
         rival: of the other.
         repeats: how often each row is measured, with noise of its own.
     """
-    return _divergence(_pair(truth, rival), repeats)
+    return _divergence(next(_pairs([truth, rival], _roots([truth, rival]))), repeats)
 
 
 def resolution(predictions: Sequence[Prediction], repeats: int = 1) -> float:
     """The least expected log Bayes factor over all ordered pairs of rivals."""
-    return min(_divergence(pair, repeats) for pair in _pairs(predictions))
+    return min(_divergence(pair, repeats) for pair in _pairs(predictions, _roots(predictions)))
 
 
 def rank(designs: Sequence[Design], needed: float = NEEDED, most: int = MOST) -> list[Ranked]:
@@ -106,7 +134,8 @@ def rank(designs: Sequence[Design], needed: float = NEEDED, most: int = MOST) ->
         needed: nats that are enough.
         most: repeats beyond which no design is followed.
     """
-    found = [_repeated(design, needed, most) for design in designs]
+    roots = _roots_of(designs)
+    found = [_repeated(design, needed, most, roots) for design in designs]
     return sorted(found, key=_price)
 
 
@@ -121,12 +150,15 @@ def recommend(designs: Sequence[Design], needed: float = NEEDED, most: int = MOS
         most: repeats beyond which no plan is followed.
     """
     order = {id(one): number for number, one in enumerate(designs)}
-    pool = sorted(designs, key=lambda one: _price(_repeated(one, needed, most)))[:_POOL]
-    chosen = [pool[0]]
-    best = _repeated(pool[0], needed, most)
+    roots = _roots_of(designs)
+    alone = sorted(
+        ((_repeated(one, needed, most, roots), one) for one in designs), key=lambda two: _price(two[0])
+    )
+    pool = [one for _, one in alone[:_POOL]]
+    chosen, best = pool[:1], alone[0][0]
     while len(chosen) < _PLACES:
         plans = [joined([*chosen, other]) for other in pool]
-        found = [_repeated(plan, needed, most) for plan in plans]
+        found = [_repeated(plan, needed, most, roots) for plan in plans]
         number = min(range(len(pool)), key=lambda k: _price(found[k]))
         if _price(found[number]) >= _price(best):
             break
@@ -182,9 +214,9 @@ def _price(one: Ranked) -> tuple[bool, float]:
     return (not one.resolves, one.cost if one.resolves else -one.nats)
 
 
-def _repeated(design: Design, needed: float, most: int) -> Ranked:
+def _repeated(design: Design, needed: float, most: int, roots: _Roots) -> Ranked:
     """The fewest repeats that are enough; evidence never falls with them."""
-    pairs = list(_pairs(design.predictions))
+    pairs = list(_pairs(design.predictions, roots))
 
     def reached(repeats: int) -> float:
         return min(_divergence(pair, repeats) for pair in pairs)
@@ -200,22 +232,13 @@ def _repeated(design: Design, needed: float, most: int) -> Ranked:
     return Ranked(design.where, high, reached(high), high * design.cost, resolves=True)
 
 
-def _pairs(predictions: Sequence[Prediction]) -> Iterator[_Pair]:
-    return (_pair(truth, rival) for truth, rival in permutations(predictions, 2))
+def _roots_of(designs: Sequence[Design]) -> _Roots:
+    return _roots([one for design in designs for one in design.predictions])
 
 
-def _pair(truth: Prediction, rival: Prediction) -> _Pair:
-    difference = truth.mean - rival.mean
-    own, other = (_columns(each) for each in (truth, rival))
-    return _Pair(
-        float(difference @ difference), other.T @ difference, own.T @ own, other.T @ other, other.T @ own
-    )
-
-
-def _columns(one: Prediction) -> Float[np.ndarray, "row parameter"]:
-    """Tangents of parameters of unit variance."""
-    shared = one.tangents @ _root(one.covariance)
-    return shared if one.own is None else np.hstack([shared, one.own])
+def _roots(predictions: Sequence[Prediction]) -> _Roots:
+    covariances = {id(one.covariance): one.covariance for one in predictions}
+    return {key: _root(covariance) for key, covariance in covariances.items()}
 
 
 def _root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
@@ -223,13 +246,34 @@ def _root(covariance: Float[np.ndarray, "n n"]) -> Float[np.ndarray, "n n"]:
     return vectors * np.sqrt(np.maximum(values, 0.0))
 
 
+def _pairs(predictions: Sequence[Prediction], roots: _Roots) -> Iterator[_Pair]:
+    laws = [_law(one, roots) for one in predictions]
+    return (_pair(truth, rival) for truth, rival in permutations(laws, 2))
+
+
+def _law(one: Prediction, roots: _Roots) -> _Law:
+    shared = one.tangents @ roots[id(one.covariance)]
+    tangents = shared if one.own is None else np.hstack([shared, one.own])
+    directions, sizes, _ = np.linalg.svd(tangents, full_matrices=False)
+    return _Law(one.mean, tangents, directions, sizes**2)
+
+
+def _pair(truth: _Law, rival: _Law) -> _Pair:
+    difference = truth.mean - rival.mean
+    return _Pair(
+        float(difference @ difference),
+        (rival.directions.T @ difference) ** 2,
+        ((rival.directions.T @ truth.tangents) ** 2).sum(1),
+        truth.sizes,
+        rival.sizes,
+    )
+
+
 def _divergence(pair: _Pair, repeats: int) -> float:
     """Of N(m, I + U U') from N(m', I + V V'), with U, V and the means repeated, by Woodbury's identity."""
     n = repeats
-    grown = np.eye(len(pair.other)) + n * pair.other
-    shrink = np.linalg.inv(grown)
-    distance = n * pair.distance - n**2 * pair.slope @ shrink @ pair.slope
-    spread = n * np.trace(pair.own) - n * np.sum(shrink * pair.other)
-    spread -= n**2 * np.einsum("ij,ik,jk->", shrink, pair.cross, pair.cross)
-    own = np.linalg.slogdet(np.eye(len(pair.own)) + n * pair.own)[1]
-    return max(0.0, 0.5 * float(distance + spread + np.linalg.slogdet(grown)[1] - own))
+    own, other = n * pair.own, n * pair.other
+    shrink = other / (1 + other)
+    distance = n * (pair.distance - shrink @ pair.along)
+    spread = own.sum() - shrink.sum() - n * shrink @ pair.cross
+    return max(0.0, 0.5 * float(distance + spread + np.log1p(other).sum() - np.log1p(own).sum()))
