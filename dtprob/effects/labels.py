@@ -67,10 +67,10 @@ def scale_bias(sites: Sites, data: Data) -> list[Effect]:
     """The predictor exaggerates or shrinks what it predicts, and is right at a level that nobody knows."""
     if not _offers(sites, data, "predicted_label"):
         return []
-    typical = 0.3
+    typical, middle = 0.3, float(np.mean(np.asarray(data["prediction"], float)))
 
     def stretch(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-        return value + (value - jnp.mean(value)) * jnp.expm1(p["log_scale"]) + p["offset"]
+        return value + (value - middle) * jnp.expm1(p["log_scale"]) + p["offset"]
 
     return [
         Effect(
@@ -78,7 +78,7 @@ def scale_bias(sites: Sites, data: Data) -> list[Effect]:
             {"predicted_label": stretch},
             (normal("log_scale", typical), normal("offset", typical * _unit(data))),
             physics="Labels differ by a common factor more than predicted from a level at which the prediction is right.",
-            source="m + (y - m) exp(a) + b, m the mean prediction: a line in place of the diagonal.",
+            source="m + (y - m) exp(a) + b, m the mean prediction in the data: a line in place of the diagonal.",
         )
     ]
 

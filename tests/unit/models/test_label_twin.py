@@ -42,6 +42,15 @@ def test_model_and_effects_keep_their_contracts():
         check_effect(effect, label_twin, data)
 
 
+def test_a_stretched_label_is_what_it_is_whatever_is_asked_beside_it():
+    data = rows(n=40)
+    effect = next(e for e in catalogue(declare(label_twin, data).sites, data) if e.family == "scale_bias")
+    stretch, size = effect.rewrites["predicted_label"], {"log_scale": 0.3, "offset": 0.1}
+    middle = data["prediction"].mean()
+    found = stretch(data["prediction"][:10], size, {})
+    np.testing.assert_allclose(found, middle + (data["prediction"][:10] - middle) * np.exp(0.3) + 0.1)
+
+
 @pytest.mark.parametrize("n", [30, 400])
 def test_an_old_map_errs_alike_nearby(n):
     data = rows(n=n)
