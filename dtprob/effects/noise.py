@@ -57,7 +57,10 @@ def _parts(label: str, coordinate: str, axis: str, *, low: float, width: float, 
                 "interference",
                 {
                     "noise_power": _raised(
-                        coordinate, axis, start, stop if part < _PARTS - 1 else float("inf")
+                        coordinate,
+                        axis,
+                        start if part else -float("inf"),
+                        stop if part < _PARTS - 1 else float("inf"),
                     )
                 },
                 (half_normal("excess", 1.0),),

@@ -13,6 +13,7 @@ from scipy.special import eval_legendre
 from dtprob.effects import Rewriting, catalogue
 from dtprob.effects.array import _detour
 from dtprob.effects.effect import Context
+from dtprob.effects.noise import interference
 from dtprob.raytracing.field import path_gain
 from dtprob.raytracing.paths import SPECULAR
 from dtprob.raytracing.pattern import field_vector
@@ -375,6 +376,16 @@ def test_noise_by_hand(world, apply):
     assert np.array_equal(jammed, np.where(np.arange(17) >= 14, 3.0, 1.0))
     burst = apply("interference[time_0]", excess=2.0)["noise_power"].ravel() / before.ravel()
     assert np.array_equal(burst, np.where(np.arange(8) < 1, 3.0, 1.0))
+
+
+def test_interference_reaches_the_lowest_subcarrier_however_its_place_is_rounded(world):
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        frequency = rng.uniform(-2e7, 2e7) + 1e5 / 3 * np.arange(int(rng.integers(16, 300)))
+        data = {"subcarrier_frequency": jnp.asarray(frequency)}
+        first = next(e for e in interference(world.sites, data) if e.instance == "band_0")
+        raised = first.rewrites["noise_power"](jnp.ones((1, 1, len(frequency), 1, 1)), {"excess": 1.0}, data)
+        assert np.ravel(raised)[0] == 2.0
 
 
 def test_extra_path_is_a_radar_echo(world, apply):
