@@ -209,10 +209,16 @@ def beta_shift(p: Parameters, t: Parameters) -> jax.Array:
 
 
 def von_mises_spread(p: Parameters) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mean cosine A, and the roots of the information on the location, k A, and on the concentration k, 1 - A / k - A^2."""
+    """Mean cosine A, and the roots of the information on the location, k A, and on the concentration k, 1 - A / k - A^2.
+
+    The latter is a difference that rounding swallows where k is large: (1 + 1 / 2 k) / 2 k^2 there.
+    """
     k = p["concentration"]
     mean = i1e(k) / i0e(k)
-    return mean, jnp.sqrt(k * mean), jnp.sqrt(1 - mean / k - mean**2)
+    large = float(jnp.finfo(mean.dtype).eps) ** -0.25
+    far = jnp.maximum(k, large)
+    spread = jnp.where(k < large, 1 - mean / k - mean**2, (1 + 0.5 / far) / (2 * far**2))
+    return mean, jnp.sqrt(k * mean), jnp.sqrt(spread)
 
 
 def von_mises_residual(p: Parameters, value: jax.Array) -> jax.Array:

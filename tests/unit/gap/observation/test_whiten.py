@@ -568,3 +568,11 @@ def test_kinds_of_a_known_distribution_are_known_and_ones_own_are_not():
 
     with pytest.raises(InputError, match="Clipped"):
         whiten.observation(Clipped(0.0, 1.0), jnp.zeros(3), "y")
+
+
+@pytest.mark.parametrize("concentration", [1e2, 1e4, 1e6, 1e9])
+def test_a_sharp_direction_tells_of_its_concentration_as_a_normal_does_of_its_precision(concentration):
+    parameters = {"loc": strong(0.0), "concentration": strong(concentration)}
+    change = {"loc": strong(0.0), "concentration": strong(1.0)}
+    root = float(likelihood("VonMises").shift(parameters, change)[1])
+    assert root == pytest.approx((1 + 0.25 / concentration) / (np.sqrt(2) * concentration), rel=1e-4)
