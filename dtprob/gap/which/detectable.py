@@ -9,7 +9,7 @@ from jaxtyping import Float
 from scipy import optimize, stats
 
 from dtprob.effects.effect import Effect, Parameter
-from dtprob.gap.fitting.plausible import scales, sizes
+from dtprob.gap.fitting.plausible import is_one_sided, scales, sizes
 
 _NOTICED: Final = 0.9
 """Probability with which it would be."""
@@ -28,7 +28,7 @@ def detectable(
     """The size, of the entry that shows most clearly at its usual size, from which on an effect is noticed; None if none.
 
     Scores of several directions are noticed by their sum of squares, chi-square with as many degrees and of noncentrality
-    size^2 J; a single one by its normal quantile, on either side.
+    size^2 J; a single one by its normal quantile, on the side that its prior allows or on either.
 
     Args:
         effect: which.
@@ -41,15 +41,14 @@ def detectable(
     best = int(np.argmax(own * scales(effect)[index] ** 2))
     if not own[best] > 0:
         return None
-    return Detectable(
-        float(np.sqrt(_needed(directions, level) / own[best])), _owner(effect, int(index[best]))
-    )
+    needed = _needed(directions, level if is_one_sided(effect) else level / 2, level)
+    return Detectable(float(np.sqrt(needed / own[best])), _owner(effect, int(index[best])))
 
 
-def _needed(directions: int, level: float) -> float:
-    """Noncentrality that is noticed."""
+def _needed(directions: int, tail: float, level: float) -> float:
+    """Noncentrality that is noticed, of a single direction beyond the quantile of a tail."""
     if directions < 2:
-        return float(stats.norm.isf(level / 2) + stats.norm.isf(1 - _NOTICED)) ** 2
+        return float(stats.norm.isf(tail) + stats.norm.isf(1 - _NOTICED)) ** 2
     threshold = float(stats.chi2.isf(level, directions))
     bracket = (0.0, 4 * threshold + 100.0)
     found = optimize.root_scalar(

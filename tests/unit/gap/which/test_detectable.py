@@ -29,6 +29,12 @@ def test_an_effect_of_the_told_size_is_noticed_nine_times_in_ten(directions):
     assert low <= noticed <= high
 
 
+def test_a_size_of_one_sign_is_noticed_on_its_side_only():
+    effect = moving(Parameter("spread", dist.HalfNormal(1.0)))
+    found = detectable(effect, np.array([4.0]), 1, LEVEL)
+    assert stats.norm.sf(stats.norm.isf(LEVEL) - 2.0 * found.size) == pytest.approx(0.9)
+
+
 def test_the_size_is_of_the_parameter_that_shows_most_at_its_usual_size():
     faint, clear = (
         Parameter("faint", dist.Normal(0.0, 0.1)),
