@@ -111,9 +111,9 @@ def changed(sites: Sequence[Site]) -> str:
 
 def _saved(plan: Mapping[str, Any]) -> str:
     """How much less that costs than everything again, where that is much."""
-    everything = plan.get("cost_of_all_again")
-    if "cost" not in plan:
+    if "cost_of_all_again" not in plan:
         return ""
+    everything = plan["cost_of_all_again"]
     if everything is None:
         return " Measuring everything again would not decide."
     times = everything / plan["cost"]

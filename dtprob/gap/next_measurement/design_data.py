@@ -57,7 +57,8 @@ def next_measurement(
     candidates = list(again)
     for name, data in designs.items():
         candidates += designs_of(_problem_at(here, data), here, fits, name)
-    whole = everything(again)
+    told = everything(again)
+    whole = told if told is not None and told.resolves else None
     best = cheapest(candidates, whole)
     return {
         "split": [list(names) for names in causes[0].alias_class],
@@ -67,13 +68,13 @@ def next_measurement(
         "resolves": best.resolves,
         "everything": best is whole,
         "cost": best.cost,
-        "cost_of_all_again": None if whole is None else whole.cost,
+        **({} if told is None else {"cost_of_all_again": None if whole is None else whole.cost}),
         "ranking": [_line(one) for one in rank(candidates)[:_SHOWN]],
     }
 
 
 def everything(again: Sequence[Design]) -> Ranked | None:
-    """All that is there, made again as often as decides; None where that never does, or there are too many fields to hold.
+    """All that is there, made again as often as decides; None where there are too many fields to hold.
 
     Args:
         again: the clusters, each measured again.
@@ -82,8 +83,7 @@ def everything(again: Sequence[Design]) -> Ranked | None:
     rows, fields = len(first[0].mean), max(0 if p.own is None else p.own.shape[1] for p in first)
     if len(again) ** 2 * rows * fields > _MOST_ENTRIES:
         return None
-    found = rank([joined(again)])[0]
-    return found if found.resolves else None
+    return rank([joined(again)])[0]
 
 
 def cheapest(candidates: Sequence[Design], whole: Ranked | None) -> Ranked:

@@ -202,6 +202,7 @@ def test_next_step_says_what_is_saved_and_what_does_not_help() -> None:
     assert said.endswith("Everything again would cost 12 times as much.")
     report = {"next_measurement": {**plan, "cost_of_all_again": None}}
     assert str(next_step(report)).endswith("Measuring everything again would not decide.")
+    assert "verything" not in str(next_step({"next_measurement": plan}))  # too much to hold: nothing is known of it
     report = {"next_measurement": {**plan, "cost_of_all_again": 1.4}}
     assert str(next_step(report)).endswith("there the explanations differ most.")
     whole = {"design": {"link": [0, 1, 2]}, "repeats": 2, "resolves": True, "cost": 6.0, "everything": True}
