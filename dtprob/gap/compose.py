@@ -43,7 +43,7 @@ def compose(
         "tried": _tried(evidence),
         "where": where(evidence, told_along),
         "gap": {**_gap(evidence), "tolerated": tolerated},
-        "unlisted": unlisted(evidence.after, settings.level / 2),
+        "unlisted": {**unlisted(evidence.after, settings.level / 2), "called_for": list(evidence.asked_for)},
         "remainder": _remainder(evidence),
         "detectable": [
             {"effect": name, "size": one.size, "parameter": one.parameter.name, "unit": one.parameter.unit}

@@ -11,6 +11,7 @@ from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
+    Final,
     Literal,
     NotRequired,
     TypedDict,
@@ -26,6 +27,8 @@ from dtprob.errors import InputError, unknown_name
 
 type Verdict = Literal["NO_GAP", "LISTED", "LISTED_WITH_REMAINDER", "UNLISTED", "UNDETERMINED"]
 type Number = float | None
+UNSEEN: Final = "nothing observed depends on it"
+"""What stands for the parameter that absorbs a candidate where there is none."""
 type Probability = Annotated[float, "0 to 1"]
 type Range = tuple[float, float]
 type BeforeAfter = tuple[Number, Number]
@@ -48,7 +51,7 @@ class Size(Interval):
 
 
 class Strata(TypedDict):
-    """The estimate of the cause's first size, made apart in each part of the data."""
+    """The estimate of the cause's first size, each time without another part of the data; none of a random field's."""
 
     estimate: list[Number]
 
@@ -126,11 +129,15 @@ class Gap(TypedDict):
 
 
 class Unlisted(TypedDict):
-    """The test for what is left after the accepted cause; `located` says how each of the sites is wrong."""
+    """The test for what is left after the accepted cause; `located` says how each of the sites is wrong.
+
+    `called_for` names effects that scores call for beside as many as are looked for.
+    """
 
     p_value: Probability | None
     sites: list[str]
     located: NotRequired[list[Site]]
+    called_for: NotRequired[list[str]]
 
 
 class Term(TypedDict):
@@ -173,7 +180,7 @@ class Detectable(TypedDict):
 
 
 class Candidate(TypedDict):
-    """One line of the screening; an effect absorbed by a fitted parameter has no statistic."""
+    """One line of the screening; an effect that a fitted parameter absorbs, or that nothing shows, has no statistic."""
 
     effect: str
     sites: list[str]

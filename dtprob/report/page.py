@@ -10,7 +10,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from dtprob.report import names, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Candidate, Interval, Report, Tried, is_quiet, validate
+from dtprob.report.json_schema import UNSEEN, Candidate, Interval, Report, Tried, is_quiet, validate
 from dtprob.report.palette import DARK, LIGHT
 from dtprob.report.story import left_over, next_look, next_step, rivals, tell
 
@@ -114,7 +114,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= {function.__name__: function for function in _FILTERS}
-    made.globals |= {function.__name__: function for function in _FUNCTIONS}
+    made.globals |= dict[str, Any]({function.__name__: function for function in _FUNCTIONS}, UNSEEN=UNSEEN)
     return made
 
 

@@ -6,7 +6,7 @@ from typing import Any
 
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Cause, Detectable, Report, Site, is_quiet
+from dtprob.report.json_schema import UNSEEN, Cause, Detectable, Report, Site, is_quiet
 from dtprob.report.names import (
     aliases,
     block,
@@ -144,13 +144,14 @@ def _no_gap(report: Report) -> Story:
     if not is_quiet(report):
         return _tolerated(report)
     screened = report.get("screening", [])
-    untold = sum(bool(row.get("absorbed_by")) for row in screened)
-    tried = f"{len(screened) - untold} known effects were tried; none of them is needed to explain these data, and"
-    beside = (
-        f" {untold} more could not be judged, because fitted parameters of the twin take up the same change."
-        if untold
-        else ""
-    )
+    untold = [row for row in screened if row.get("absorbed_by")]
+    unseen = sum(row.get("absorbed_by") == UNSEEN for row in untold)
+    tried = f"{len(screened) - len(untold)} known effects were tried; none of them is needed to explain these data, and"
+    beside = ""
+    if absorbed := len(untold) - unseen:
+        beside = f" {absorbed} more could not be judged, because fitted parameters of the twin take up the same change."
+    if unseen:
+        beside += f" {unseen} could not be judged, because nothing that was observed depends on them."
     return Story(
         "No gap found",
         "good",
@@ -188,11 +189,13 @@ def _seen(detectable: list[Detectable]) -> str:
 
 def _listed(report: Report) -> Story:
     cause = report["causes"][0]
-    rest = (
-        "What is left is not chance, but small beside the cause."
-        if report["unlisted"]["sites"]
-        else "What is left is no more than chance."
-    )
+    called_for = report["unlisted"].get("called_for", [])
+    if report["unlisted"]["sites"]:
+        rest = "What is left is not chance, but small beside the cause."
+    elif called_for:
+        rest = f"The data call for one more effect, {together(called_for)}, which is small beside the cause."
+    else:
+        rest = "What is left is no more than chance."
     return Story(
         "Cause found",
         "found",

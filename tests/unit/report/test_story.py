@@ -1,9 +1,10 @@
 """Words for names, sizes and verdicts."""
 
+from dtprob.gap.fitting import soundness
 from dtprob.report import names
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Cause, Detectable
+from dtprob.report.json_schema import UNSEEN, Cause, Detectable
 from dtprob.report.page import bar, ranked
 from dtprob.report.story import advice, left_over, next_look, next_step, tell
 
@@ -193,6 +194,26 @@ def _report(**terms: list[float]) -> names.Any:
     }
 
 
+def test_what_cannot_be_judged_is_said_with_its_reason() -> None:
+    report = {**_report(), "verdict": "NO_GAP"}
+    idle = {**report["screening"][2], "effect": "d", "absorbed_by": UNSEEN}
+    meaning = tell({**report, "screening": [*report["screening"], idle, idle]}).meaning
+    assert meaning.startswith("2 known effects were tried")
+    assert (
+        "1 more could not be judged, because fitted parameters of the twin take up the same change."
+        in meaning
+    )
+    assert "2 could not be judged, because nothing that was observed depends on them." in meaning
+    assert soundness.UNSEEN == UNSEEN
+    assert "could not be judged" not in tell({**report, "screening": report["screening"][:2]}).meaning
+
+
+def test_what_is_called_for_beside_the_cause_is_no_chance() -> None:
+    assert "What is left is no more than chance." in tell(_report()).meaning
+    more = {**_report(), "unlisted": {"p_value": 0.5, "sites": [], "called_for": ["slow_drift"]}}
+    assert "The data call for one more effect, slow drift, which is small" in tell(more).meaning
+
+
 def test_next_step_says_what_is_saved_and_what_does_not_help() -> None:
     plan = {"design": {"design": "roof_sites", "link": 3}, "repeats": 1, "resolves": True, "cost": 1.0}
     report: names.Any = {"next_measurement": {**plan, "cost_of_all_again": 12.0}}
@@ -202,7 +223,9 @@ def test_next_step_says_what_is_saved_and_what_does_not_help() -> None:
     assert said.endswith("Everything again would cost 12 times as much.")
     report = {"next_measurement": {**plan, "cost_of_all_again": None}}
     assert str(next_step(report)).endswith("Measuring everything again would not decide.")
-    assert "verything" not in str(next_step({"next_measurement": plan}))  # too much to hold: nothing is known of it
+    assert "verything" not in str(
+        next_step({"next_measurement": plan})
+    )  # too much to hold: nothing is known of it
     report = {"next_measurement": {**plan, "cost_of_all_again": 1.4}}
     assert str(next_step(report)).endswith("there the explanations differ most.")
     whole = {"design": {"link": [0, 1, 2]}, "repeats": 2, "resolves": True, "cost": 6.0, "everything": True}
