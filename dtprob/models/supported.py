@@ -76,7 +76,10 @@ def _refuse_latent(what: str, name: str, fn: Any) -> None:
     support = base_constraint(fn.support)
     kind = f"{name!r} ({type(fn).__name__})"
     if support is None or support.is_discrete:
-        remedy = "Sum it out in the model (numpyro.factor), since the density must have a gradient"
+        remedy = (
+            "Sum it out, since the density must have a gradient: observe a MixtureSameFamily or MixtureGeneral, or for "
+            "counts a ZeroInflatedDistribution (numpyro.factor is enough for fit, not for diagnose)"
+        )
         raise InputError(what, "continuous latent sites", f"the discrete latent site {kind}", remedy)
     if support is constraints.complex:
         remedy = "Sample its real and imaginary parts as two sites"
