@@ -44,16 +44,29 @@ def deviation(p: ArrayLike, *, one_sided: bool) -> np.ndarray:
 
 def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Upper-tail p-value and normal quantile of a positive statistic with the given null mean and variance."""
+    nothing, value, shape = _as_gamma(observed, mean, variance)
+    log_p = gamma_log_tail(observed, mean, variance)
+    lower = special.ndtri_exp(np.log(np.maximum(special.gammainc(shape, value), 1e-300)))
+    quantile = np.where((log_p > np.log(0.5)) & ~nothing, lower, normal_quantile(log_p))
+    return np.exp(np.maximum(log_p, LOG_SMALLEST)), quantile
+
+
+def gamma_log_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> np.ndarray:
+    """Log upper-tail p-value of a positive statistic with the given null mean and variance; 0 where the mean is 0."""
+    nothing, value, shape = _as_gamma(observed, mean, variance)
+    return np.where(nothing, 0.0, log_gamma_tail(value, shape))
+
+
+def _as_gamma(
+    observed: np.ndarray, mean: np.ndarray, variance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Where the mean is 0, and the value and the shape of a unit gamma elsewhere."""
     nothing = mean <= 0
     mean, variance = (
         np.where(nothing, 1.0, mean),
         np.where(nothing, 1.0, np.maximum(variance, 1e-12 * mean**2)),
     )
-    value, shape = np.where(nothing, 1.0, observed) * mean / variance, mean**2 / variance
-    log_p = np.where(nothing, 0.0, log_gamma_tail(value, shape))
-    lower = special.ndtri_exp(np.log(np.maximum(special.gammainc(shape, value), 1e-300)))
-    quantile = np.where((log_p > np.log(0.5)) & ~nothing, lower, normal_quantile(log_p))
-    return np.exp(np.maximum(log_p, LOG_SMALLEST)), quantile
+    return nothing, np.where(nothing, 1.0, observed) * mean / variance, mean**2 / variance
 
 
 _MOST_SKEW: Final = 1.7
@@ -63,18 +76,22 @@ _ALIKE: Final = 1e-9
 
 
 def largest_tail(largest: np.ndarray) -> np.ndarray:
-    """Upper-tail p-values of the largest of many squared scores over their variance: of replicates, and of the data, last.
+    """Upper-tail p-values of the largest of many squared scores over variances: of replicates, and of the data, last."""
+    return beyond_largest(largest, largest[:-1])
+
+
+def beyond_largest(values: np.ndarray, null: np.ndarray) -> np.ndarray:
+    """Upper-tail p-values of values, each the largest of many, against those of replicates.
 
     The replicates' own are taken as Gumbel, which the largest square of many normal scores is; where they are more skew,
     their roots are. Where these are, too, as of rare outcomes, or all alike, nothing is said.
     """
-    null = largest[:-1]
     if _is_too_skew(null):
-        largest, null = np.sqrt(largest), np.sqrt(null)
+        values, null = np.sqrt(values), np.sqrt(null)
     if _is_too_skew(null):
-        return np.ones_like(largest)
+        return np.ones_like(values)
     scale = max(float(null.std()) * np.sqrt(6.0) / np.pi, 1e-12)
-    log_rate = -(largest - float(null.mean())) / scale - np.euler_gamma
+    log_rate = -(values - float(null.mean())) / scale - np.euler_gamma
     return np.maximum(-np.expm1(-np.exp(np.minimum(log_rate, 30.0))), np.exp(LOG_SMALLEST))
 
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Final
 
 import numpy as np
 
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import likelihood
-from dtprob.gap.tails import family_wise, gamma_tail
+from dtprob.gap.tails import LOG_SMALLEST, beyond_largest, gamma_log_tail, gamma_tail
+
+_LEVEL: Final = 0.01
 
 
 @dataclass(frozen=True)
@@ -36,11 +39,13 @@ def scan_coordinates(
 ) -> tuple[tuple[CoordinateFinding, ...], dict[str, np.ndarray]]:
     """Energy of the whitened residuals over dyadic blocks of every axis, against its bootstrap distribution.
 
+    Blocks of one length are told from the most that chance makes of any of them, which the replicates show, and the lengths
+    share the level: where readings are skew one of them strays farther than a block, and would hide it.
+
     Returns the blocks that stand out, family-wise at 1%, and for each axis the energy at its positions as a normal
     score (squares of few rows are far from normal), NaN where nothing is observed.
     """
-    blocks: list[tuple[str, int, int]] = []
-    p, excess, maps = [], [], {}
+    found, maps, tests = [], {}, 0
     located = problem.rows.by_cluster(problem.rows.located) == 1
     seen_as_outcomes = any(likelihood(family).is_outcome for family in problem.families.values())
     for axis, position in problem.rows.coordinates.items():
@@ -52,24 +57,41 @@ def scan_coordinates(
         mean, variance = energy[1:].mean(0), energy[1:].var(0)
         maps[axis] = np.where(variance > 0, gamma_tail(energy[:1], mean, variance)[1][0], np.nan)
         cumulative = np.concatenate([np.zeros((len(energy), 1)), np.cumsum(energy, axis=1)], axis=1)
-        low, high = np.array(list(_windows(size, ordered=axis != problem.declaration.cluster))).T
-        inside = cumulative[:, high + 1] - cumulative[:, low]
-        blocks += ((axis, *window) for window in zip(low.tolist(), high.tolist(), strict=True))
-        tail = gamma_tail(inside, inside[1:].mean(0), inside[1:].var(0))[0]
-        if seen_as_outcomes:
-            tail[0] = np.maximum(tail[0], _one_event(drawn.rows[0], index, inside[0], low, high))
-        p.append(tail)
-        excess.append((inside[0] - inside[1:].mean(0)) / 2)
-    if not blocks:
-        return (), maps
-    tails = np.concatenate(p, axis=1)
-    adjusted = family_wise(tails[0], tails[1:].min(axis=1))
-    found = [
-        CoordinateFinding(*block, p_value=float(adjusted[i]), excess=float(e))
-        for i, (block, e) in enumerate(zip(blocks, np.concatenate(excess), strict=True))
-        if adjusted[i] < 0.01
+        for low, high in _windows(size, ordered=axis != problem.declaration.cluster):
+            inside = cumulative[:, high + 1] - cumulative[:, low]
+            log_p = _log_p(inside)
+            if seen_as_outcomes:
+                log_p = np.maximum(log_p, _one_event(drawn.rows, index, inside, low, high))
+            root = np.sqrt(-log_p)  # energies of skew readings have tails of roots
+            p = beyond_largest(root[0], root[1:].max(axis=1))
+            excess = (inside[0] - inside[1:].mean(0)) / 2
+            found += _found(axis, low, high, p, excess)
+            tests += 1
+    adjusted = [replace(block, p_value=tests * block.p_value) for block in found]
+    return _without_overlap([block for block in adjusted if block.p_value < _LEVEL]), maps
+
+
+def _found(
+    axis: str, low: np.ndarray, high: np.ndarray, p: np.ndarray, excess: np.ndarray
+) -> list[CoordinateFinding]:
+    return [
+        CoordinateFinding(axis, int(low[i]), int(high[i]), float(p[i]), float(excess[i]))
+        for i in np.flatnonzero(p < _LEVEL)
     ]
-    return _without_overlap(found), maps
+
+
+def _log_p(inside: np.ndarray) -> np.ndarray:
+    """Log p-values of the energy (draw, block), each by the moments of the replicates other than itself.
+
+    A replicate that shares in the moments is never as far out as the data may be.
+    """
+    null, n = inside[1:], len(inside) - 2
+    mean = null.mean(0)
+    off = null - mean
+    square = (off**2).sum(0)
+    means = np.concatenate([mean[None], mean - off / n])
+    variances = np.concatenate([square[None] / (n + 1), (square - off**2) / n - (off / n) ** 2])
+    return np.maximum(gamma_log_tail(inside, means, variances), LOG_SMALLEST)
 
 
 def _energy(rows: np.ndarray, index: np.ndarray, size: int) -> np.ndarray:
@@ -80,25 +102,30 @@ def _energy(rows: np.ndarray, index: np.ndarray, size: int) -> np.ndarray:
 def _one_event(
     rows: np.ndarray, index: np.ndarray, inside: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> np.ndarray:
-    """Chance that a block holds one outcome as rare as its rarest, 0 where that makes less than half of its energy.
+    """Log chance that a block (draw, block) holds one outcome as rare as its rarest, if that makes half of its energy.
 
     A square of mean 1 reaches r^2 with a probability of 1 / r^2 at most (Markov), and an outcome as rare as this does.
     Replicates that never see it know nothing of its chance.
     """
-    place, size = index[index >= 0], int(index.max()) + 1
-    largest, count = np.zeros(size), np.concatenate([[0], np.cumsum(np.bincount(place, minlength=size))])
-    np.maximum.at(largest, place, rows[index >= 0] ** 2)
-    rarest = np.array([largest[a:b].max() for a, b in zip(low.tolist(), (high + 1).tolist(), strict=True)])
+    keep, size = index >= 0, int(index.max()) + 1
+    place = index[keep]
+    count = np.concatenate([[0], np.cumsum(np.bincount(place, minlength=size))])
+    largest = np.zeros((len(rows), size + 1))
+    for one, values in zip(largest, rows, strict=True):
+        np.maximum.at(one, place, values[keep] ** 2)
+    ends = np.stack([low, high + 1], axis=1).reshape(-1)
+    rarest = np.maximum.reduceat(largest, ends, axis=1)[:, ::2]
     n = count[high + 1] - count[low]
-    return np.where(2 * rarest > inside, np.minimum(n / np.maximum(rarest, 1e-300), 1.0), 0.0)
+    chance = np.log(np.maximum(n, 1)) - np.log(np.maximum(rarest, 1e-300))
+    return np.where(2 * rarest > inside, np.minimum(chance, 0.0), -np.inf)
 
 
-def _windows(size: int, *, ordered: bool) -> Iterator[tuple[int, int]]:
-    """Single positions; on ordered axes also half-overlapping blocks of dyadic length below the whole."""
+def _windows(size: int, *, ordered: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """First and last of single positions; on ordered axes also of half-overlapping blocks of dyadic length, by length."""
     length = 1
     while length < size:
-        for low in range(0, size - length + 1, max(length // 2, 1)):
-            yield low, low + length - 1
+        low = np.arange(0, size - length + 1, max(length // 2, 1))
+        yield low, low + length - 1
         length *= 2
         if not ordered:
             return
