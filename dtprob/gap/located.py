@@ -7,6 +7,7 @@ from typing import Any, Final
 
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.tails import told_apart
+from dtprob.gap.where.coordinates import CoordinateFinding
 from dtprob.gap.where.locate import Location, SiteFinding
 from dtprob.gap.where.reach import Told, reached, told
 
@@ -30,25 +31,37 @@ def where(evidence: Evidence, told_along: Mapping[str, Told]) -> dict[str, Any]:
         told_along: what each position along the axes tells of the accepted causes.
     """
     gap = evidence.floor.best - float(evidence.held_before.log_likelihood.sum())
-    blocks = reached(told_along, evidence.problem.declaration.cluster)
-    axes = {block.axis for block in blocks}  # on all others the blocks whose misfit stands out
-    coordinates = (*blocks, *(b for b in evidence.before.coordinates if b.axis not in axes))
     accepted = [e for e in evidence.problem.effects if e.name in evidence.accepted]
+    sizes = sum(effect.dimension for effect in accepted if effect.kind == "mean")
+    blocks = reached(told_along, evidence.problem.declaration.cluster, sizes)
+    axes = {block.axis for block in blocks}
+    others = [b for b in evidence.before.coordinates if b.axis not in axes]  # blocks whose misfit stands out
     share = evidence.fraction.mean if evidence.fraction is not None else 0.0
     closed = {site: share for effect in accepted for site in effect.sites}
     before = evidence.before.sites
     sites = zip(before, site_shares(before, gap, closed), strict=True)
+    gained = {axis: float(here.gain.sum()) for axis, here in told_along.items()}
+    is_known, there_is = evidence.fraction is not None, gap >= _LEAST_GAP
     return {
         "sites": [_located(*one) for one in sorted(sites, key=_rank)],
         "coordinates": [
-            {
-                "axes": {c.axis: [c.low, c.high]},
-                "p_value": c.p_value,
-                "share": min(max(c.excess, 0.0) / gap, 1.0) if gap >= _LEAST_GAP else None,
-            }
-            for c in coordinates
+            *(
+                _block(b, share * _part_of(b.excess, gained[b.axis]) if is_known and there_is else None)
+                for b in blocks
+            ),
+            *(_block(b, _part_of(b.excess, gap) if there_is else None) for b in others),
         ],
     }
+
+
+def _part_of(nats: float, whole: float) -> float:
+    """The share of a whole, nothing where it is none."""
+    return min(max(nats, 0.0) / whole, 1.0) if whole > 0 else 0.0
+
+
+def _block(found: CoordinateFinding, share: float | None) -> dict[str, Any]:
+    parts = {"parts": [list(part) for part in found.parts]} if found.parts else {}
+    return {"axes": {found.axis: [found.low, found.high]}, **parts, "p_value": found.p_value, "share": share}
 
 
 def unlisted(after: Location, level: float) -> dict[str, Any]:

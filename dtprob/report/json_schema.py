@@ -98,9 +98,13 @@ class Site(TypedDict):
 
 
 class Coordinates(TypedDict):
-    """A block of the data: for each axis its first and last coordinate; with its share of the gap."""
+    """A block of the data: for each axis its first and last coordinate; with its share of the gap.
+
+    Where several blocks of one axis are told together `parts` holds each of them.
+    """
 
     axes: dict[str, Range]
+    parts: NotRequired[list[Range]]
     p_value: Probability | None
     share: Number
 

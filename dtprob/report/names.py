@@ -57,6 +57,8 @@ LEVEL = 0.05
 LOG: Final = "log_"
 _LARGEST: Final = 700.0
 """Largest exponent whose exponential is a number."""
+_PARTS: Final = 4
+"""Blocks told together that are named."""
 _DIGITS: Final = 4
 """Digits of a number in the user's own terms, however little it changes."""
 
@@ -220,11 +222,17 @@ def detail(value: Any) -> str:
 
 
 def block(entry: Coordinates) -> str:
-    """A block of the data: `rx antenna 0 to 1, subcarrier 40 to 63`."""
-    return ", ".join(
-        f"{words(axis)} {low:.6g}" + ("" if low == high else f"\u00a0to\u00a0{high:.6g}")
-        for axis, (low, high) in entry["axes"].items()
-    )
+    """A block of the data: `rx antenna 0 to 1, subcarrier 40 to 63`; of several `row 3, 7 to 9 and 40 more, together`."""
+    if parts := entry.get("parts"):
+        shown = [_span(*part) for part in parts[:_PARTS]]
+        more = [f"{len(parts) - _PARTS} more"] if len(parts) > _PARTS else []
+        return f"{listing(map(words, entry['axes']))} {listing([*shown, *more])}, together"
+    return ", ".join(f"{words(axis)} {_span(*ends)}" for axis, ends in entry["axes"].items())
+
+
+def _span(low: float, high: float) -> str:
+    """`3`, or `7 to 9` on one line."""
+    return f"{low:.6g}" + ("" if low == high else f"\u00a0to\u00a0{high:.6g}")
 
 
 def is_factor(parameter: str, unit: str) -> bool:

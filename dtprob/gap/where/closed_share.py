@@ -37,8 +37,7 @@ def closed_shares(along: Mapping[str, Told]) -> dict[str, ClosedShare]:
         along: what each position tells of the causes, by axis.
     """
     shares = {}
-    for axis, (product, energy) in along.items():
-        gain = product - energy / 2
-        if len(gain) > 1 and (total := float(gain.sum())) > 0:
-            shares[axis] = ClosedShare(gain / total, energy / 2 / total, total)
+    for axis, here in along.items():
+        if len(here.gain) > 1 and (total := float(here.gain.sum())) > 0:
+            shares[axis] = ClosedShare(here.gain / total, here.energy / 2 / total, total)
     return shares

@@ -25,6 +25,7 @@ class CoordinateFinding:
         low, high: first and last position of the block.
         p_value: family-wise over all blocks of all axes.
         excess: whitened energy above its expectation, in nats.
+        parts: first and last position of each block, where several are told together.
     """
 
     axis: str
@@ -32,6 +33,7 @@ class CoordinateFinding:
     high: int
     p_value: float
     excess: float
+    parts: tuple[tuple[int, int], ...] = ()
 
 
 def scan_coordinates(

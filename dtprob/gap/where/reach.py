@@ -2,16 +2,18 @@
 
 Misfit spread over many rows hides in their noise, as `coordinates` looks at it. Once a cause is known, the data are looked
 at along what it changes: u = <delta, r> over a block, delta being the whitened shift from the base fit to the fit with the
-causes and r the projected residuals of the base fit. Where nothing is closed u / |delta| is at most a standard normal.
+causes, in the size that tells most to first order, and r the projected residuals of the base fit. Where nothing is closed
+u / |delta| is a standard normal if the causes have one size, and at most as long as so many of them if they have several.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 from scipy import stats
 
 from dtprob.gap.fitting.active import means_among
@@ -21,6 +23,7 @@ from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.refit import at_null_except
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
+from dtprob.gap.observation.whiten import Observation
 from dtprob.gap.where.coordinates import CoordinateFinding
 
 _HELD: Final = 0.9
@@ -28,13 +31,24 @@ _HELD: Final = 0.9
 _LOCAL: Final = 0.5
 """Share of an axis's positions up to which a cause is at some place of it, and not everywhere."""
 _LEVEL: Final = 0.01
+_ROUNDING: Final = 1e-12
+"""Share of the most that any position is changed up to which one is not changed at all."""
 
 
 class Told(NamedTuple):
-    """What each position (position,) of an axis tells of the causes: <delta, r> and <delta, delta>."""
+    """What each position (position,) of an axis tells of the causes: <delta, r> and <delta, delta>.
+
+    `touched` says where the causes change something themselves, and not only the refitted nuisances.
+    """
 
     product: Float[np.ndarray, " position"]
     energy: Float[np.ndarray, " position"]
+    touched: Bool[np.ndarray, " position"]
+
+    @property
+    def gain(self) -> Float[np.ndarray, " position"]:
+        """Nats that each position gains, to first order."""
+        return self.product - self.energy / 2
 
 
 class _Block(NamedTuple):
@@ -48,12 +62,12 @@ class _Block(NamedTuple):
 
     @property
     def z(self) -> float:
-        """Standard normal where the causes do nothing."""
+        """Standard normal where a cause of one size does nothing."""
         return self.product / np.sqrt(self.energy)
 
     def found(self, p_value: float) -> CoordinateFinding:
-        """The block with the nats that the best size of what the causes do here would gain, if they do it at all."""
-        return CoordinateFinding(self.axis, self.low, self.high, p_value, max(self.z, 0.0) ** 2 / 2)
+        """The block with the nats that it gains."""
+        return CoordinateFinding(self.axis, self.low, self.high, p_value, self.product - self.energy / 2)
 
 
 def told(problem: Problem, base: Fit, projection: Projection, wider: Problem, fitted: Fit) -> dict[str, Told]:
@@ -66,52 +80,76 @@ def told(problem: Problem, base: Fit, projection: Projection, wider: Problem, fi
         wider: the model with effects live.
         fitted: its fit with some of them; random fields among these are left out.
     """
-    rows = problem.rows
-    delta = np.where(rows.by_cluster(rows.located) == 1, _shift(problem, base, wider, fitted), 0.0)
-    if not np.isfinite(delta).all() or not (delta**2).any():
+    rows, kept = problem.rows, means_among(wider, fitted.effects)
+    if not kept:
+        return {}
+    there = wider.compiled.observations(at_null_except(wider, fitted, kept))
+    without = wider.compiled.observations(at_null_except(wider, fitted, ()))
+    located = rows.by_cluster(rows.located) == 1
+    delta, own = (
+        np.where(located, _shift(problem, start, there), 0.0)
+        for start in (problem.compiled.observations(base.x), without)
+    )
+    if not np.isfinite(delta + own).all() or not (delta**2).any():
         return {}
     _, projected = observed_rows(problem, base, projection)
+    size = float((delta * projected).sum() / (delta**2).sum())  # a large shift is not linear
+    if size <= 0:
+        return {}
+    delta = size * delta
     found = {}
     for axis, position in rows.coordinates.items():
         index = rows.by_cluster(position)
         keep = index >= 0
         product = np.bincount(index[keep], weights=(delta * projected)[keep])
-        found[axis] = Told(product, np.bincount(index[keep], weights=delta[keep] ** 2))
+        energy, by_causes = (np.bincount(index[keep], weights=shift[keep] ** 2) for shift in (delta, own))
+        found[axis] = Told(product, energy, by_causes > _ROUNDING * by_causes.max())
     return found
 
 
-def reached(along: Mapping[str, Told], unordered: str | None) -> tuple[CoordinateFinding, ...]:
+def reached(along: Mapping[str, Told], unordered: str | None, sizes: int) -> tuple[CoordinateFinding, ...]:
     """Blocks of every axis that hold what mean effects close, family-wise at 1%; none of an axis they fill.
 
     Each block is told on its own as far as that goes (Holm 1979). The others of an axis, too weak alone, are told together:
-    all of them where what they hold in sum is no chance, with its p-value.
+    as one finding of several parts where what they hold in sum is no chance.
 
     Args:
         along: what each position tells, by axis.
         unordered: the axis of clusters, whose neighbours make no block.
+        sizes: how many parameters the effects have, fitted to these data.
     """
     blocks = [
-        _Block(axis, low, high, *(float(part[low : high + 1].sum()) for part in here))
+        _Block(axis, low, high, *(float(part[low : high + 1].sum()) for part in (here.product, here.energy)))
         for axis, here in along.items()
-        for low, high in _held(here.energy, together=axis != unordered)
+        for low, high in _held(np.where(here.touched, here.energy, 0.0), together=axis != unordered)
     ]
     blocks.sort(key=lambda block: -block.z)
     step_down = np.maximum.accumulate(
-        [float(stats.norm.sf(block.z)) * (len(blocks) - k) for k, block in enumerate(blocks)]
+        [_chance(block.z, sizes) * (len(blocks) - k) for k, block in enumerate(blocks)]
     )
     found = [block.found(float(p)) for block, p in zip(blocks, step_down, strict=True) if p < _LEVEL]
     weak = blocks[len(found) :]
     for axis in along:
-        rest = [block for block in weak if block.axis == axis]
-        if len(rest) > 1 and (p := _together(rest) * len(along)) < _LEVEL:
-            found += [block.found(p) for block in rest]
+        rest = sorted((block for block in weak if block.axis == axis), key=lambda block: block.low)
+        if len(rest) > 1:
+            all_of_them = _together(rest)
+            if (p := _chance(all_of_them.z, sizes) * len(along)) < _LEVEL:
+                parts = tuple((block.low, block.high) for block in rest)
+                found.append(replace(all_of_them.found(p), parts=parts))
     return tuple(sorted(found, key=lambda b: -b.excess))
 
 
-def _together(blocks: list[_Block]) -> float:
-    """Chance that blocks hold as much in sum where the causes do nothing."""
-    product, energy = sum(b.product for b in blocks), sum(b.energy for b in blocks)
-    return float(stats.norm.sf(product / np.sqrt(energy)))
+def _chance(z: float, sizes: int) -> float:
+    """That blocks tell as much of causes whose sizes were fitted to them, where these do nothing."""
+    return float(stats.chi2.sf(max(z, 0.0) ** 2, sizes))
+
+
+def _together(blocks: list[_Block]) -> _Block:
+    """All of them, from the first to the last, and what they hold."""
+    first, last = blocks[0], blocks[-1]
+    return _Block(
+        first.axis, first.low, last.high, sum(b.product for b in blocks), sum(b.energy for b in blocks)
+    )
 
 
 def _held(energy: Float[np.ndarray, " position"], *, together: bool) -> Iterator[tuple[int, int]]:
@@ -127,12 +165,12 @@ def _held(energy: Float[np.ndarray, " position"], *, together: bool) -> Iterator
     yield from ((int(run[0]), int(run[-1])) for run in runs)
 
 
-def _shift(problem: Problem, base: Fit, wider: Problem, fitted: Fit) -> np.ndarray:
-    """Whitened shift (cluster, row) of the observed distributions from the base fit to the one with the mean effects."""
-    kept = means_among(wider, fitted.effects)
-    there = wider.compiled.observations(at_null_except(wider, fitted, kept)) if kept else {}
+def _shift(
+    problem: Problem, start: Mapping[str, Observation], there: Mapping[str, Observation]
+) -> Float[np.ndarray, "cluster row"]:
+    """Whitened shift of the observed distributions from one point to another."""
     shifts = {}
-    for name, observed in problem.compiled.observations(base.x).items():
+    for name, observed in start.items():
         moved = there.get(name, observed)
         if moved.family != observed.family:
             moved = observed  # another family is no shift

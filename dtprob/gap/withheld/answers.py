@@ -222,7 +222,8 @@ class Answer:
                 i
                 for b in blocks
                 if axis in b["axes"]
-                for i in range(b["axes"][axis][0], b["axes"][axis][1] + 1)
+                for low, high in b.get("parts", [b["axes"][axis]])
+                for i in range(low, high + 1)
             }
             scores.append(2 * len(said & set(cells)) / (len(said) + len(cells)))
         return scores

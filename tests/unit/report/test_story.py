@@ -35,6 +35,13 @@ def test_names_become_words() -> None:
     assert names.term("power_dbm_rmse") == names.term("power_rmse_db") == "power error (root mean square)"
 
 
+def test_blocks_told_together_are_one_line() -> None:
+    parts = [(3.0, 3.0), (7.0, 9.0), *((k, k) for k in (11.0, 13.0, 17.0, 19.0))]
+    block: names.Coordinates = {"axes": {"row": (3, 19)}, "parts": parts, "p_value": 1e-5, "share": 0.4}
+    assert names.block(block) == "row 3, 7\u00a0to\u00a09, 11, 13 and 2 more, together"
+    assert names.block({"axes": {"row": (3, 4)}, "p_value": 1e-5, "share": 0.4}) == "row 3\u00a0to\u00a04"
+
+
 def test_aliases_leave_the_cause_out() -> None:
     assert names.aliases(_cause("a", "b", alias=[["b", "a"], ["c"]])) == [["c"]]
 
