@@ -16,7 +16,7 @@ from dtprob.gap.located import along, unlisted, where
 from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.closed_share import closed_shares
-from dtprob.gap.where.locate import SiteFinding
+from dtprob.gap.where.site_finding import SiteFinding
 from dtprob.gap.which.screen import Screening
 from dtprob.gap.which.trials import credit
 from dtprob.inference.engine import AbstractEngine

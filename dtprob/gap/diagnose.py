@@ -26,7 +26,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
-from dtprob.gap.where.locate import most_left
+from dtprob.gap.where.site_finding import most_left
 from dtprob.gap.which.classes import credible
 from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.search import search

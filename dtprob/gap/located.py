@@ -8,8 +8,9 @@ from typing import Any, Final
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.tails import told_apart
 from dtprob.gap.where.coordinates import CoordinateFinding
-from dtprob.gap.where.locate import Location, SiteFinding
+from dtprob.gap.where.locate import Location
 from dtprob.gap.where.reach import Told, reached, told
+from dtprob.gap.where.site_finding import SiteFinding
 
 _TOLD: Final = 0.01
 """Probability up to which a site comes before those that have no more than a larger share."""

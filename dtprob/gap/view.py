@@ -11,7 +11,8 @@ from dtprob.gap.fitting.bootstrap import replicate
 from dtprob.gap.fitting.projection import Projection, project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.locate import NOWHERE, Location, locate, most_gained
+from dtprob.gap.where.locate import NOWHERE, Location, locate
+from dtprob.gap.where.site_finding import most_gained
 from dtprob.gap.which.places import place
 from dtprob.gap.which.screen import Screening, screen
 

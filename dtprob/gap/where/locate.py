@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -22,7 +22,7 @@ from dtprob.gap.model.conditioned import conditioned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
-from dtprob.gap.tails import family_wise, told_apart
+from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.where.curves import curves
 from dtprob.gap.where.data_columns import whole_columns
@@ -30,14 +30,13 @@ from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.gains import gains
-from dtprob.gap.where.moments import further_moments, moment
+from dtprob.gap.where.moments import further_moments
 from dtprob.gap.where.quantities import Quantity, groups, quantity
+from dtprob.gap.where.site_finding import SURE, SiteFinding, rank, shadows_last
 from dtprob.gap.where.suspects import Suspect, suspects
 
 _ALL_SPREAD: Final = 0.999
 """Share of what a site moves that lies in spreads where it moves nothing else."""
-_SURE: Final = 0.005
-"""Probability below which a site is surely wrong."""
 _MORE: Final = 400
 """Replicates of a second look at the sites, at least; a third one takes all that the settings allow."""
 _OPEN_AT_FIRST: Final = (1e-9, 0.1)
@@ -48,49 +47,6 @@ _OPEN_AT_SECOND: Final = (0.01, 10.0)
 """Multiples of the level between which a second look does not tell it either."""
 _OPEN_OF_OUTCOMES: Final = 1e-6
 """The lower one of outcomes and counts: hundreds of replicates still understate how far rare ones stray."""
-
-
-@dataclass(frozen=True)
-class SiteFinding:
-    """Evidence that a site's values are wrong.
-
-    Attributes:
-        site: its name.
-        family: what is added ("additive", "relative", "conjugate", "spread", ...) and how it varies.
-        p_value: family-wise over all sites and families.
-        gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order; None
-            where nothing that a model computes would move it.
-        last: whether it may be the shadow of another: a wrong mean spreads too, and far strays look like wrong means.
-        spreads: whether moving the site moves nothing but spreads of observations.
-    """
-
-    site: str
-    family: str
-    p_value: float
-    gain: float | None
-    last: bool = False
-    spreads: bool = False
-
-    @property
-    def moment(self) -> str | None:
-        """What of an observation is wrong: its spread, or what lies beyond; None where values are."""
-        return moment(self.family)
-
-
-def most_gained(found: Iterable[SiteFinding]) -> float:
-    """Nats that moving the best of these sites would gain; zero where there is none."""
-    return max((one.gain for one in found if one.gain is not None), default=0.0)
-
-
-def most_left(found: Iterable[SiteFinding]) -> float:
-    """Nats that are left at the worst of these sites at least.
-
-    Of a moment that nothing a model computes would move, such as what goes together, about -log p, as a likelihood ratio of
-    it would have; not where it may be the shadow of another site.
-    """
-    sites = tuple(found)
-    told = (-math.log(max(one.p_value, 1e-300)) for one in sites if one.gain is None and not one.last)
-    return max(most_gained(sites), max(told, default=0.0))
 
 
 @dataclass(frozen=True)
@@ -138,12 +94,13 @@ def locate(
     for times, (low, high) in _further_looks(drawn, settings, shown=shown, discrete=ways.normal is not None):
         if low < seen.p_value < high:
             seen = _test_sites(problem, fitted, projection, more(drawn, times), ways)
-    sure = {f.site for f in seen.of_sites if f.p_value <= _SURE}
+    sure = {f.site for f in seen.of_sites if f.p_value <= SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.evidence))
     entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
     towards_data = {name: -i for i, name in enumerate(problem.declaration.sites)}
-    ordered = tuple(sorted(_shadows_last(seen.findings), key=lambda f: (*_rank(f), towards_data[f.site])))
+    findings = shadows_last(seen.findings, _energy(problem, drawn))
+    ordered = tuple(sorted(findings, key=lambda f: (*rank(f), towards_data[f.site])))
     strays = differences(problem, drawn)
     return Location(ordered, blocks, maps, seen.p_value, suspected, entries, strays)
 
@@ -266,23 +223,11 @@ def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
             yield gain.reshape(*site.value.shape, -1).sum(-1)
 
 
-def _shadows_last(findings: Sequence[SiteFinding]) -> list[SiteFinding]:
-    """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong.
-
-    A site that says how observations spread is one of their moments, by whatever name.
-    """
-    values = [f.moment is None and not f.spreads for f in findings]
-    of_values = min((f.p_value for f, one in zip(findings, values, strict=True) if one), default=1.0)
-    of_moments = min((f.p_value for f, one in zip(findings, values, strict=True) if not one), default=1.0)
-    sure, by_noise = of_values <= _SURE, of_moments < of_values**2
-    return [
-        replace(f, last=sure and is_value == by_noise) for f, is_value in zip(findings, values, strict=True)
-    ]
-
-
-def _rank(found: SiteFinding) -> tuple[bool, float, float]:
-    """The surest first, then the largest gain; sites that rounding alone parts, one acting through another, are equal."""
-    return found.last, told_apart(found.p_value), -told_apart(found.gain or 0.0)
+def _energy(problem: Problem, drawn: Replicates) -> float:
+    """Of the data's residuals, over its mean over replicates."""
+    located = problem.rows.by_cluster(problem.rows.located) == 1
+    energy = (drawn.rows[:, located] ** 2).sum(1)
+    return float(energy[0] / max(energy[1:].mean(), 1e-300))
 
 
 def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> SiteFinding:
@@ -290,6 +235,12 @@ def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> Sit
     best = min(tests, key=lambda test: test.p_value)
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
     return SiteFinding(name, best.family.label, p_value, None)
+
+
+def _each(test: FamilyTest) -> float:
+    """The data's squared score over its variance, on average over the entries; tells families apart where p-values end."""
+    seen = test.variance > 1e-12 * max(float(test.variance.max(initial=0.0)), 1e-300)
+    return float((test.first[0, seen] ** 2 / test.variance[seen]).mean()) if seen.any() else 0.0
 
 
 def _finding(
@@ -303,7 +254,7 @@ def _finding(
     smallest: np.ndarray,
 ) -> SiteFinding:
     """The family of a site with the smallest p-value, with the gain along its steepest direction."""
-    best = min(tests, key=lambda test: (test.p_value, -float((test.first[0] ** 2).sum())))
+    best = min(tests, key=lambda test: (test.p_value, -_each(test)))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
     spread_rows = problem.rows.by_cluster(problem.rows.located) == 0
@@ -312,4 +263,5 @@ def _finding(
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][spread_rows] ** 2) > _ALL_SPREAD * moved)
-    return SiteFinding(site.name, best.family.label, p_value, net, spreads=spreads)
+    score = max(map(_each, tests))
+    return SiteFinding(site.name, best.family.label, p_value, net, spreads=spreads, score=score)

@@ -6,7 +6,8 @@ import pytest
 
 from dtprob.gap.compose import summary
 from dtprob.gap.located import site_shares, unlisted
-from dtprob.gap.where.locate import Location, SiteFinding
+from dtprob.gap.where.locate import Location
+from dtprob.gap.where.site_finding import SiteFinding
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,7 @@
 """Of sites that a gap shows at alike, the one nearest to the data is named first, whatever rounding says."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +11,10 @@ import pytest
 
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.locate import SiteFinding, _shadows_last
+from dtprob.gap.where.site_finding import SiteFinding, shadows_last
 from dtprob.inference import Laplace
 from dtprob.models.declaration import model
+from tests.unit.gap.examples import line
 
 
 @model(axes={"distance": ("segment", "sample"), "power": ("segment", "sample")}, cluster="segment")
@@ -42,4 +45,30 @@ def test_a_site_that_only_spreads_comes_after_values_that_are_surely_wrong(of_sp
     """By whatever name; unless it is more than twice as surely wrong."""
     mean = SiteFinding("mean", "additive, common", 1e-4, 20.0)
     deviation = SiteFinding("deviation", "relative, common", of_spread, 20.0, spreads=True)
-    assert min(_shadows_last([deviation, mean]), key=lambda found: found.last).site == first
+    assert min(shadows_last([deviation, mean], 4.0), key=lambda found: found.last).site == first
+
+
+@pytest.mark.parametrize(("score", "first"), [(40.0, "spread"), (200.0, "mean")])
+def test_where_p_values_end_values_with_scores_that_noise_makes_come_last(score, first):
+    """Noise of four times the energy makes squared scores of four on average, and some of 40 among many."""
+    mean = SiteFinding("mean", "relative, row", 1e-200, 800.0, score=score)
+    spread = SiteFinding("y", "spread, common", 3e-285, 8000.0)
+    assert min(shadows_last([mean, spread], 4.0), key=lambda found: found.last) == replace(
+        mean if first == "mean" else spread, last=False
+    )
+
+
+@pytest.mark.parametrize("what", ["spread", "mean"])
+def test_far_off_it_is_still_told_whether_the_mean_or_its_noise_is_wrong(what):
+    """Noise of ten times the deviation at a fifth of the readings, or a mean that bends by as much."""
+    rng = np.random.default_rng(7)
+    x = rng.uniform(-1.0, 1.0, (30, 20))
+    noise = np.where((what == "spread") & (np.arange(20) % 5 == 0), 5.0, 0.5)
+    y = x + noise * rng.normal(size=x.shape) + (5.0 * x**2 if what == "mean" else 0.0)
+    settings = Settings(replicates=100, site_replicates=50)
+    data = {"x": jnp.asarray(x), "y": jnp.asarray(y)}
+    found = diagnose(line, data, [], key=jax.random.key(0), engine=Laplace(), settings=settings)
+    site = found.sections["unlisted"]["located"][0]
+    assert (site["site"], site["family"].startswith("spread")) == (
+        ("mean", False) if what == "mean" else ("y", True)
+    )

@@ -1,0 +1,85 @@
+"""What is found at a model's sites, and in which order: one that is wrong makes others look so."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Final
+
+from dtprob.gap.tails import LOG_SMALLEST, told_apart
+from dtprob.gap.where.moments import moment
+
+SURE: Final = 0.005
+"""Probability below which a site is surely wrong."""
+_END: Final = math.exp(LOG_SMALLEST + 14)
+"""Probability near which p-values, adjusted for many tests, end."""
+_LIKE_NOISE: Final = 20.0
+"""Times the residuals' energy up to which a squared score over its variance is as noise makes it, in the best of many."""
+
+
+@dataclass(frozen=True)
+class SiteFinding:
+    """Evidence that a site's values are wrong.
+
+    Attributes:
+        site: its name.
+        family: what is added ("additive", "relative", "conjugate", "spread", ...) and how it varies.
+        p_value: family-wise over all sites and families.
+        gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order; None
+            where nothing that a model computes would move it.
+        last: whether it may be the shadow of another: a wrong mean spreads too, and far strays look like wrong means.
+        spreads: whether moving the site moves nothing but spreads of observations.
+        score: squared score of its values over the variance, on average over the entries of the family that has most.
+    """
+
+    site: str
+    family: str
+    p_value: float
+    gain: float | None
+    last: bool = False
+    spreads: bool = False
+    score: float = math.inf
+
+    @property
+    def moment(self) -> str | None:
+        """What of an observation is wrong: its spread, or what lies beyond; None where values are."""
+        return moment(self.family)
+
+
+def most_gained(found: Iterable[SiteFinding]) -> float:
+    """Nats that moving the best of these sites would gain; zero where there is none."""
+    return max((one.gain for one in found if one.gain is not None), default=0.0)
+
+
+def most_left(found: Iterable[SiteFinding]) -> float:
+    """Nats that are left at the worst of these sites at least.
+
+    Of a moment that nothing a model computes would move, such as what goes together, about -log p, as a likelihood ratio of
+    it would have; not where it may be the shadow of another site.
+    """
+    sites = tuple(found)
+    told = (-math.log(max(one.p_value, 1e-300)) for one in sites if one.gain is None and not one.last)
+    return max(most_gained(sites), max(told, default=0.0))
+
+
+def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFinding]:
+    """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong.
+
+    A site that says how observations spread is one of their moments, by whatever name. Where p-values end values come last
+    if their scores are no larger than noise of such an energy (of the residuals, over its expectation) makes them.
+    """
+    values = [f.moment is None and not f.spreads for f in findings]
+    of_values = min((f.p_value for f, one in zip(findings, values, strict=True) if one), default=1.0)
+    of_moments = min((f.p_value for f, one in zip(findings, values, strict=True) if not one), default=1.0)
+    score = max((f.score for f, one in zip(findings, values, strict=True) if one), default=0.0)
+    by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
+    return [
+        replace(f, last=of_values <= SURE and is_value == by_noise)
+        for f, is_value in zip(findings, values, strict=True)
+    ]
+
+
+def rank(found: SiteFinding) -> tuple[bool, float, float]:
+    """The surest first, then the largest gain; sites that rounding alone parts, one acting through another, are equal."""
+    return found.last, told_apart(found.p_value), -told_apart(found.gain or 0.0)
