@@ -158,9 +158,9 @@ def _causes(
     effects = [e for e in evidence.last.problem.effects if e.name in evidence.accepted]
     sizes, plausible = confirm(evidence.last.problem, evidence.fitted, effects, key, engine)
     classes, probability = alternatives(evidence, settings)
-    first = effects[0].site_name(effects[0].parameters[0].name)
-    estimates = evidence.held_after.estimates.get(first)
-    strata = () if estimates is None else tuple(float(v) for v in estimates[:, 0])
+    first = min(effects, key=lambda effect: effect.kind == "variance")  # as their sizes are told
+    estimates = evidence.held_after.estimates[first.site_name(first.parameters[0].name)]
+    strata = tuple(float(v) for v in estimates[:, 0])
     physics = " ".join(e.physics for e in effects if e.physics)
     cause = Cause(
         effects=evidence.accepted,

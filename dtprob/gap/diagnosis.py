@@ -36,7 +36,7 @@ class Cause:
         closed_fraction: on held-out clusters; None where not established.
         shares: how much of that each effect closes, where there are several.
         physics: one line.
-        strata: the first size's estimate in the fit without each fold; none of a random field's.
+        strata: the first size's estimate in the fit without each fold.
         plausible: whether the size lies within what the effect's prior calls plausible.
     """
 

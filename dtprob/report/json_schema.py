@@ -51,7 +51,7 @@ class Size(Interval):
 
 
 class Strata(TypedDict):
-    """The estimate of the cause's first size, each time without another part of the data; none of a random field's."""
+    """The estimate of the cause's first size, each time without another part of the data."""
 
     estimate: list[Number]
 

@@ -16,6 +16,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 from scipy import special
 
+from dtprob.effects.effect import Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.refit import at_null_except
@@ -140,10 +141,21 @@ def judged(problem: Problem, folds: Iterable[Fold]) -> HeldOut:
         for name, miss in problem.compiled.misses(part.x).items():
             before = missed.get(name, Miss(0.0, 0.0, 0.0))
             missed[name] = Miss(*(b + np.where(held, m, 0.0) for b, m in zip(before, miss, strict=True)))
-        for block in (b for name in part.effects for b in problem.blocks_of(name) if not b.local):
-            estimates.setdefault(block.name, []).append(part.x[block.index[0]])
+        for effect in (e for e in problem.effects if e.name in part.effects):
+            for parameter in effect.parameters:
+                name = effect.site_name(parameter.name)
+                estimates.setdefault(name, []).append(_estimate(problem, part, effect, parameter))
     stacked = {n: np.stack(v) for n, v in estimates.items()}
     return HeldOut(log_likelihood, missed, stacked, doubt, np.flatnonzero(alone))
+
+
+def _estimate(
+    problem: Problem, fitted: fitting.Fit, effect: Effect, parameter: Parameter
+) -> Float[np.ndarray, " entry"]:
+    """A parameter at a fit; the size of a variance effect is the spread of its field."""
+    if parameter in effect.fitted:
+        return fitted.x[problem.layout[effect.site_name(parameter.name)].index[0]]
+    return np.array([fitted.spread[effect.name]])
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.closed import Floor, HeldOut
 from dtprob.gap.how_far.terms import in_user_terms
 from dtprob.gap.model.problem import Problem
-from tests.unit.gap.examples import SIGMA, bend, draw, line
+from tests.unit.gap.examples import SIGMA, bend, draw, jitter, line
 
 
 def held(log_likelihood):
@@ -50,6 +50,17 @@ def test_cross_fit_judges_each_cluster_by_the_others():
         np.testing.assert_allclose(found.misses["y"].error[out], (residual**2).sum(1), atol=0.05)
     missed = found.misses["y"].error.sum()
     np.testing.assert_allclose(in_user_terms(problem, found, None)["y_rmse"][0], np.sqrt(missed / y.size))
+
+
+def test_the_size_of_a_random_field_in_each_fold_is_its_spread():
+    data, rng = draw("line"), np.random.default_rng(4)
+    problem = Problem(line, draw("line", shift=0.8 * rng.normal(size=data["x"].shape)), [jitter()])
+    problem = problem.with_live([jitter().name])
+    fitted = fitting.fit(problem, problem.null(), [jitter().name])
+    (name,) = (jitter().site_name(p.name) for p in jitter().parameters)
+    found = closed.cross_fit(problem, fitted, closed.folds(12, 3)).estimates[name]
+    assert found.shape == (3, 1)
+    np.testing.assert_allclose(found, fitted.spread[jitter().name], rtol=0.4)
 
 
 @pytest.mark.parametrize(("fault", "is_told"), [(0.0, False), (1.0, True)])
