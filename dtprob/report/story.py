@@ -71,7 +71,7 @@ def next_step(report: Report) -> str | None:
     offered = plan["design"].get("design")
     place = f"{place} of the design {words(offered)}" if offered else place
     if not plan.get("resolves", True):
-        return f"No measurement that is known of tells the explanations apart, however often made; {place} comes nearest."
+        return f"No measurement that is known of tells the explanations apart, however often made; nearest: {place}."
     times = plan.get("repeats", 1)
     if plan.get("everything"):
         return f"Measure everything again{f' {times} times' * (times > 1)}: no few places decide for less."
