@@ -11,6 +11,7 @@ import numpy as np
 
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
+from dtprob.gap.fitting.at_end import shared_draws
 from dtprob.gap.how_far.terms import in_user_terms
 from dtprob.gap.located import along, unlisted, where
 from dtprob.gap.maps import maps
@@ -215,12 +216,8 @@ def _alike(first: Screening) -> dict[str, Any]:
 def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
     problem, fitted = evidence.problem, evidence.base
     names = {b.name for b in problem.blocks_of(None) if not b.local}
-    noise = np.asarray(jax.random.normal(key, (_DRAWS, len(fitted.global_index))))
-    root = np.linalg.cholesky(fitted.covariance) if len(fitted.global_index) else fitted.covariance
     draws: dict[str, list[np.ndarray]] = {name: [] for name in names}
-    for step in noise:
-        x = fitted.x.copy()
-        x[fitted.global_index] += root @ step
+    for x in shared_draws(problem, fitted, _DRAWS, key):
         for name, value in problem.compiled.sites(x).items():
             if name in names:
                 draws[name].append(np.asarray(value).reshape(-1))

@@ -10,6 +10,7 @@ import numpy as np
 
 from dtprob.errors import InputError
 from dtprob.gap.fitting.active import activate, basis
+from dtprob.gap.fitting.at_end import at_end
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.fitting.states import are_states
@@ -101,6 +102,7 @@ def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
         found.append(
             f"what numpyro.factor adds ({names}) counts as a prior, and no gap is looked for in it; {remedy}"
         )
+    found += [f"{name} is at the end of its prior" for name in at_end(problem, fitted)]
     return (*found, *_too_large(problem, fitted), *_misfit(problem, fitted), *_undetermined(problem, fitted))
 
 
@@ -163,7 +165,8 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
     known = [owner for owner, s in zip(owners, seen, strict=True) if s]
     weak = np.abs(vectors[:, values < _SINGULAR]).max(axis=1, initial=0.0)
     absorbed = [owner for owner, weight in zip(known, weak, strict=True) if weight > _TAKES_PART]
-    if absorbed:
+    ends = at_end(problem, fitted)  # there the data hardly move anything
+    if absorbed and not set(absorbed) & set(ends):
         found.append(
             f"the data determine only a combination of {_listed(absorbed)}; their priors tell the rest"
         )

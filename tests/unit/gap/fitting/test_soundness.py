@@ -11,6 +11,7 @@ from dtprob.cli import main
 from dtprob.effects import Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
+from dtprob.gap.fitting.at_end import at_end, shared_draws
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.fitting.soundness import UNSEEN, check_noise, idle, notes
 from dtprob.gap.model.problem import Problem
@@ -232,3 +233,25 @@ def test_a_site_of_far_more_entries_than_the_data_is_not_looked_at_and_this_is_s
         (Parameter("gain", dist.Normal(0.0, 1.0)),),
     )
     assert set(Problem(crowded, data, [louder]).float_sites) == {"mean", "each"}
+
+
+def test_a_parameter_that_the_data_push_to_the_end_of_its_prior_is_said_and_stays_there():
+    """Of 20,000 trials .55 succeed, of at most .5: the posterior is exponential at that end."""
+
+    def model(trials, hits=None):
+        chance = numpyro.sample("chance", dist.Uniform(0.0, 0.5))
+        with numpyro.plate("link", 40):
+            share = numpyro.deterministic("share", chance + jnp.zeros(40))
+            numpyro.sample("hits", dist.Binomial(trials, share), obs=hits)
+
+    problem = Problem(model, {"trials": jnp.full(40, 500), "hits": jnp.full(40, 275)}, ())
+    fitted = fit_base(problem, jax.random.key(0))
+    assert at_end(problem, fitted) == ("chance",)
+    assert "chance is at the end of its prior" in notes(problem, fitted)
+    points = shared_draws(problem, fitted, 400, jax.random.key(1))
+    drawn = np.array([float(problem.compiled.sites(x)["chance"]) for x in points])
+    grid = 0.5 - np.linspace(1e-6, 0.02, 20_000)
+    log_density = 11_000 * np.log(grid) + 9_000 * np.log1p(-grid)
+    below = np.cumsum(np.exp(log_density - log_density.max())[::-1])
+    expected = grid[::-1][np.searchsorted(below / below[-1], [0.05, 0.5])]
+    np.testing.assert_allclose(0.5 - np.quantile(drawn, [0.05, 0.5]), 0.5 - expected, rtol=0.25)
