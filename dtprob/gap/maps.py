@@ -33,7 +33,8 @@ def maps(evidence: Evidence, closed: Mapping[str, ClosedShare]) -> dict[str, xr.
         where[f"closed_{axis}"] = (axis, share.found, {"nats": share.total})
         where[f"closed_expected_{axis}"] = (axis, share.expected)
     problem, name = evidence.problem, evidence.problem.cluster_name
-    per, least = np.maximum(problem.n_observation_of_each, 1.0), _floor(evidence)
+    per = np.maximum(problem.n_observation_of_each, 1.0)
+    least = _floor(evidence, per)
     clusters: dict[str, Any] = {
         "before": (name, -evidence.held_before.log_likelihood / per - least),
         "after": (name, -evidence.held_after.log_likelihood / per - least),
@@ -64,12 +65,15 @@ def maps(evidence: Evidence, closed: Mapping[str, ClosedShare]) -> dict[str, xr.
     }
 
 
-def _floor(evidence: Evidence) -> np.ndarray:
+def _floor(evidence: Evidence, count: np.ndarray) -> np.ndarray:
     """Nats per observation below which no cluster is expected to come (cluster,), all together at the floor of the whole.
 
     Noise that is known to be larger in one cluster is no gap there.
+
+    Args:
+        evidence: of the diagnosis.
+        count: observations of each cluster (cluster,).
     """
-    count = np.maximum(evidence.problem.n_observation_of_each, 1.0)
     expected = expected_loss(evidence.last.problem, evidence.fitted.x)
     return expected / count - (evidence.floor.best + expected.sum()) / count.sum()
 

@@ -45,7 +45,7 @@ def deviation(p: ArrayLike, *, one_sided: bool) -> np.ndarray:
 def gamma_tail(observed: np.ndarray, mean: np.ndarray, variance: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Upper-tail p-value and normal quantile of a positive statistic with the given null mean and variance."""
     nothing, value, shape = _as_gamma(observed, mean, variance)
-    log_p = gamma_log_tail(observed, mean, variance)
+    log_p = np.where(nothing, 0.0, log_gamma_tail(value, shape))
     lower = special.ndtri_exp(np.log(np.maximum(special.gammainc(shape, value), 1e-300)))
     quantile = np.where((log_p > np.log(0.5)) & ~nothing, lower, normal_quantile(log_p))
     return np.exp(np.maximum(log_p, LOG_SMALLEST)), quantile

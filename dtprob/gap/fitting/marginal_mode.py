@@ -174,9 +174,8 @@ class _Volumes:
     def __init__(self, problem: Problem, x: np.ndarray, index: Int[np.ndarray, " shared"]) -> None:
         self._problem, self._index = problem, index
         self._x, self.here = _inner(problem, x, _EXACT)
-        own, is_own = activate(problem).local_index, not states(problem).blocks
-        self._own = own if is_own else own[:, :0]
-        self._follow = following(problem, self._x, index) if is_own else None
+        self._own = activate(problem).local_index
+        self._follow = None if states(problem).blocks else following(problem, self._x, index)
 
     def __call__(self, move: Float[np.ndarray, " shared"]) -> Float[np.ndarray, " cluster"]:
         moved = self._x.copy()

@@ -122,7 +122,7 @@ def _too_large(problem: Problem, fitted: Fit) -> list[str]:
 
 def _misfit(problem: Problem, fitted: Fit) -> list[str]:
     residual = np.asarray(problem.compiled.residual(fitted.x))
-    located = problem.rows.by_cluster(problem.rows.located) == 1
+    located = problem.rows.is_location
     size = float(np.sqrt(np.mean(residual[located] ** 2))) if located.any() else 0.0
     if size < _MISFIT:
         return []

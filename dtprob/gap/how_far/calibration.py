@@ -53,8 +53,7 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
         problem: on whose data the fits were made.
         folds: which clusters were left out, and the fits to the others.
     """
-    counted = problem.in_rows(problem.counted) > 0
-    located = counted & (problem.rows.by_cluster(problem.rows.located) == 1)
+    located = problem.rows.is_location & (problem.in_rows(problem.counted) > 0)
     inside, squares = [], []
     families: set[str] = set()
     for held, part, _ in folds:

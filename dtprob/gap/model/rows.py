@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -32,6 +33,16 @@ class Rows:
     located: np.ndarray
     gather: np.ndarray
     cluster_name: str
+
+    @cached_property
+    def is_location(self) -> np.ndarray:
+        """Which rows (cluster, row) stand for a location or probability; padding does not."""
+        return self.by_cluster(self.located) == 1
+
+    @cached_property
+    def is_spread(self) -> np.ndarray:
+        """Which rows (cluster, row) stand for a spread; padding does not."""
+        return self.by_cluster(self.located) == 0
 
     @property
     def n_cluster(self) -> int:

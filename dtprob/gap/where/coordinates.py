@@ -13,7 +13,8 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.tails import LOG_SMALLEST, beyond_largest, gamma_log_tail, gamma_tail
 
-_LEVEL: Final = 0.01
+LEVEL: Final = 0.01
+"""Family-wise, of everything that is told of parts of the data."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +49,7 @@ def scan_coordinates(
     score (squares of few rows are far from normal), NaN where nothing is observed.
     """
     found, maps, tests = [], {}, 0
-    located = problem.rows.by_cluster(problem.rows.located) == 1
+    located = problem.rows.is_location
     seen_as_outcomes = any(likelihood(family).is_outcome for family in problem.families.values())
     for axis, position in problem.rows.coordinates.items():
         index = np.where(located, problem.rows.by_cluster(position), -1)
@@ -70,7 +71,7 @@ def scan_coordinates(
             found += _found(axis, low, high, p, excess)
             tests += 1
     adjusted = [replace(block, p_value=tests * block.p_value) for block in found]
-    return _without_overlap([block for block in adjusted if block.p_value < _LEVEL]), maps
+    return _without_overlap([block for block in adjusted if block.p_value < LEVEL]), maps
 
 
 def _found(
@@ -78,7 +79,7 @@ def _found(
 ) -> list[CoordinateFinding]:
     return [
         CoordinateFinding(axis, int(low[i]), int(high[i]), float(p[i]), float(excess[i]))
-        for i in np.flatnonzero(p < _LEVEL)
+        for i in np.flatnonzero(p < LEVEL)
     ]
 
 

@@ -51,6 +51,11 @@ class FamilyTest(NamedTuple):
     first: np.ndarray
     variance: np.ndarray
 
+    @property
+    def seen(self) -> np.ndarray:
+        """Which entries (entry,) the data depend on."""
+        return self.variance > 1e-12 * max(float(self.variance.max(initial=0.0)), 1e-300)
+
 
 def family_test(family: Family, scores: np.ndarray, normal: np.ndarray | None = None) -> FamilyTest:
     """Test a family's squared scores (1 + replicate, entry), each entry scaled by its null variance.

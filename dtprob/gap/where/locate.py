@@ -218,15 +218,15 @@ def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
             and test.family.pattern.kept == wide
             and test.family.pattern.curves is None
         ):
-            seen = test.variance > 1e-12 * max(float(test.variance.max(initial=0.0)), 1e-300)
-            gain = np.where(seen, 0.5 * (test.first[0] ** 2 / np.where(seen, test.variance, 1.0) - 1), 0.0)
+            gain = np.where(
+                test.seen, 0.5 * (test.first[0] ** 2 / np.where(test.seen, test.variance, 1.0) - 1), 0.0
+            )
             yield gain.reshape(*site.value.shape, -1).sum(-1)
 
 
 def _energy(problem: Problem, drawn: Replicates) -> float:
     """Of the data's residuals, over its mean over replicates."""
-    located = problem.rows.by_cluster(problem.rows.located) == 1
-    energy = (drawn.rows[:, located] ** 2).sum(1)
+    energy = (drawn.rows[:, problem.rows.is_location] ** 2).sum(1)
     return float(energy[0] / max(energy[1:].mean(), 1e-300))
 
 
@@ -239,7 +239,7 @@ def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> Sit
 
 def _each(test: FamilyTest) -> float:
     """The data's squared score over its variance, on average over the entries; tells families apart where p-values end."""
-    seen = test.variance > 1e-12 * max(float(test.variance.max(initial=0.0)), 1e-300)
+    seen = test.seen
     return float((test.first[0, seen] ** 2 / test.variance[seen]).mean()) if seen.any() else 0.0
 
 
@@ -257,11 +257,10 @@ def _finding(
     best = min(tests, key=lambda test: (test.p_value, -_each(test)))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
-    spread_rows = problem.rows.by_cluster(problem.rows.located) == 0
-    gain = gains(drawn.rows[: 1 + CHANCE], shifts, spread_rows)
+    gain = gains(drawn.rows[: 1 + CHANCE], shifts, problem.rows.is_spread)
     net = max(float(gain[0] - gain[1:].mean()), 0.0)
     p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
     moved = np.sum(shifts[0] ** 2)
-    spreads = bool(moved > 0 and np.sum(shifts[0][spread_rows] ** 2) > _ALL_SPREAD * moved)
+    spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
     score = max(map(_each, tests))
     return SiteFinding(site.name, best.family.label, p_value, net, spreads=spreads, score=score)

@@ -24,13 +24,12 @@ from dtprob.gap.fitting.refit import at_null_except
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
 from dtprob.gap.observation.whiten import Observation
-from dtprob.gap.where.coordinates import CoordinateFinding
+from dtprob.gap.where.coordinates import LEVEL, CoordinateFinding
 
 _HELD: Final = 0.9
 """Share of what the causes tell that the positions of an axis hold together."""
 _LOCAL: Final = 0.5
 """Share of an axis's positions up to which a cause is at some place of it, and not everywhere."""
-_LEVEL: Final = 0.01
 _ROUNDING: Final = 1e-12
 """Share of the most that any position is changed up to which one is not changed at all."""
 
@@ -85,9 +84,8 @@ def told(problem: Problem, base: Fit, projection: Projection, wider: Problem, fi
         return {}
     there = wider.compiled.observations(at_null_except(wider, fitted, kept))
     without = wider.compiled.observations(at_null_except(wider, fitted, ()))
-    located = rows.by_cluster(rows.located) == 1
     delta, own = (
-        np.where(located, _shift(problem, start, there), 0.0)
+        np.where(rows.is_location, _shift(problem, start, there), 0.0)
         for start in (problem.compiled.observations(base.x), without)
     )
     if not np.isfinite(delta + own).all() or not (delta**2).any():
@@ -127,13 +125,13 @@ def reached(along: Mapping[str, Told], unordered: str | None, sizes: int) -> tup
     step_down = np.maximum.accumulate(
         [_chance(block.z, sizes) * (len(blocks) - k) for k, block in enumerate(blocks)]
     )
-    found = [block.found(float(p)) for block, p in zip(blocks, step_down, strict=True) if p < _LEVEL]
+    found = [block.found(float(p)) for block, p in zip(blocks, step_down, strict=True) if p < LEVEL]
     weak = blocks[len(found) :]
     for axis in along:
         rest = sorted((block for block in weak if block.axis == axis), key=lambda block: block.low)
         if len(rest) > 1:
             all_of_them = _together(rest)
-            if (p := _chance(all_of_them.z, sizes) * len(along)) < _LEVEL:
+            if (p := _chance(all_of_them.z, sizes) * len(along)) < LEVEL:
                 parts = tuple((block.low, block.high) for block in rest)
                 found.append(replace(all_of_them.found(p), parts=parts))
     return tuple(sorted(found, key=lambda b: -b.excess))

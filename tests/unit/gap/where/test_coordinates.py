@@ -14,7 +14,9 @@ def scanned(observed, null, *, outcomes=False):
     """The scan of residuals (cluster, row), one row for each of three devices."""
     position = np.broadcast_to(np.arange(3), observed.shape)
     rows = SimpleNamespace(
-        located=np.ones(observed.shape), coordinates={"device": position}, by_cluster=lambda values: values
+        is_location=np.ones(observed.shape, bool),
+        coordinates={"device": position},
+        by_cluster=lambda values: values,
     )
     families = {"heard": "BernoulliLogits" if outcomes else "Normal"}
     problem = SimpleNamespace(rows=rows, declaration=SimpleNamespace(cluster="link"), families=families)
@@ -37,7 +39,7 @@ def test_single_readings_of_a_right_twin_stay_where_normal_scores_do():
     rows = rng.standard_normal((400, 200, 1))
     position = np.arange(200)[:, None]
     one = SimpleNamespace(
-        located=np.ones((200, 1)), coordinates={"row": position}, by_cluster=lambda values: values
+        is_location=np.ones((200, 1), bool), coordinates={"row": position}, by_cluster=lambda values: values
     )
     problem = SimpleNamespace(
         rows=one, declaration=SimpleNamespace(cluster="row"), families={"heard": "Normal"}
@@ -72,7 +74,7 @@ def test_one_rare_outcome_is_no_misfit_that_replicates_have_not_seen():
 def rows_in_order(rows, *, outcomes=False):
     """The scan of residuals (draw, row) of a table of which each row is a cluster, in order."""
     one = SimpleNamespace(
-        located=np.ones((1, rows.shape[1])),
+        is_location=np.ones((1, rows.shape[1]), bool),
         coordinates={"row": np.arange(rows.shape[1])[None]},
         by_cluster=lambda values: values,
     )
