@@ -17,21 +17,19 @@ from dtprob.gap.fitting.base import fit_base, followed
 from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.marginal_mode import (
-    STEP,
     Around,
     about_the_mode,
     around,
     beside,
     fitted_at,
     height_at,
+    steps,
 )
 from dtprob.gap.fitting.states import held, states
 from dtprob.gap.fitting.sweep import turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.trials import Say, Start
 
-_STEP: Final = 0.5
-"""Of the differences about a joint mode, in standard deviations of a coordinate's posterior, at most."""
 _MATTERS: Final = 4.0
 """Squared distance of a joint mode from the marginal one, in standard deviations, from which it is not taken."""
 _RUNAWAY: Final = 10.0
@@ -73,7 +71,7 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
 @np.errstate(over="ignore", invalid="ignore")  # a runaway's curvatures may overflow: it is not near
 def _is_near_the_marginal_one(problem: Problem, joint: Fit, free: Around) -> bool:
     """Whether a joint mode is no farther from the marginal one than what the data tell apart."""
-    near = np.minimum(STEP * free.scale, _STEP * np.sqrt(np.diag(joint.covariance)))
+    near = steps(free, joint)
     up, down = beside(problem, joint.x, free, near)
     slope = (up - down).sum(axis=0) / (2 * near)
     return bool(slope @ joint.covariance @ slope < _MATTERS)

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
 import numpy as np
 from jaxtyping import Float, Int
 
-from dtprob.gap.fitting.active import LOG_2PI, Active, activate, basis
+from dtprob.gap.fitting.active import LOG_2PI, Active, activate
 from dtprob.gap.fitting.density import cluster_terms, curved, moved, rescored, system_at, terms_of
 from dtprob.gap.fitting.fit import Fit, fit
-from dtprob.gap.fitting.newton import local_step, positive
+from dtprob.gap.fitting.newton import System, local_step, positive
 from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
 
@@ -20,6 +21,8 @@ _DAMPING: Final = 1e-3
 """Of a cluster's first step, as a share of its curvatures."""
 _SLOW: Final = 2
 """Steps by which the curvatures of Gauss and Newton should have arrived."""
+_HOLDS: Final = 0.25
+"""Share of the last step's promise below which the next one's shows that kept curvatures still hold."""
 _GAIN: Final = 0.1
 """Nats by which a fit has to be better to be another one."""
 
@@ -68,7 +71,7 @@ def own_mode(
     *,
     steps: int = 30,
     tolerance: float = 1e-3,
-    near: bool = False,
+    near: System | None = None,
 ) -> tuple[np.ndarray, np.ndarray]:
     """The point with each cluster's own coordinates at their mode given the shared ones, and their curvature there.
 
@@ -76,16 +79,16 @@ def own_mode(
         problem: the model and candidates on their data.
         active: which coordinates are free.
         x: where to start.
-        steps: at most so many; those after the first two take the curvature of the log posterior itself.
+        steps: at most so many; those after the first two take the curvature of the log posterior itself, kept while it
+            holds.
         tolerance: stop when the gain that a step promises, in nats per cluster, falls below.
-        near: whether all steps take that curvature, since the mode is near.
+        near: a system whose curvatures nearly hold, since the mode is near; see `following`.
     """
     x, terms, damping = x.copy(), cluster_terms(problem, active, x), np.full(problem.n_cluster, _DAMPING)
-    own = active.own
-    system = system_at(problem, own, x)
+    own, promised, is_exact = active.own, np.inf, near is not None
+    system = system_at(problem, own, x) if near is None else rescored(problem, own, x, near)
     for number in range(steps):
-        is_exact = near or number >= _SLOW
-        step = local_step(curved(problem, own, x, system) if is_exact else system, damping)
+        step = local_step(system, damping)
         trial = moved(own, x, step)
         new = cluster_terms(problem, active, trial)
         better = new > terms
@@ -94,25 +97,29 @@ def own_mode(
         damping = np.where(better, damping / 4, damping * 4)
         if step.gain < tolerance * problem.n_cluster:
             break
-        system = rescored(problem, own, x, system) if is_exact else system_at(problem, own, x)
+        if not is_exact and number + 1 < _SLOW:
+            system = system_at(problem, own, x)
+            continue
+        system = rescored(problem, own, x, system)
+        if not (is_exact and step.gain < _HOLDS * promised):
+            system, is_exact = curved(problem, own, x, system), True
+        promised = step.gain
     return x, positive(system_at(problem, own, x).local)
 
 
 def following(
-    problem: Problem, x: np.ndarray, index: Int[np.ndarray, " shared"]
-) -> Float[np.ndarray, "cluster own shared"]:
-    """How the mode of the clusters' own coordinates moves with shared ones, at that mode.
+    problem: Problem, x: np.ndarray, effects: Sequence[str], index: Int[np.ndarray, " shared"]
+) -> tuple[System, Float[np.ndarray, "cluster own shared"]]:
+    """The system of the clusters' own coordinates at their mode, and how that mode moves with shared ones.
 
     Args:
         problem: the model on its data.
         x: the point.
-        index: positions of the shared coordinates.
+        effects: names of the mean effects that are free.
+        index: positions of the shared coordinates, of the model or of these effects.
     """
-    own = activate(problem).own
-    local = own.local_index
-    along = np.zeros((len(index), problem.dimension))
-    along[np.arange(len(index)), index] = 1.0
-    everywhere = np.concatenate([basis(problem, own), along])
-    rows = problem.compiled.curvature(x, own.weights, everywhere)[:, local]
-    curvature, cross = (np.moveaxis(part, 0, -1) for part in np.split(rows, [local.shape[1]]))
-    return -np.nan_to_num(np.linalg.solve(positive(np.nan_to_num(curvature)), np.nan_to_num(cross)))
+    active = activate(problem, effects)
+    system = curved(problem, active, x, system_at(problem, active, x))
+    place = np.searchsorted(active.global_index, index)
+    cross = np.swapaxes(system.cross[:, place], 1, 2)
+    return system.own, -np.nan_to_num(np.linalg.solve(positive(system.local), cross))

@@ -19,6 +19,7 @@ from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.marginal import following, own_mode
+from dtprob.gap.fitting.newton import System
 from dtprob.gap.fitting.plausible import nulls, scales, sides
 from dtprob.gap.fitting.states import held, states, states_mode
 from dtprob.gap.model.problem import Problem
@@ -32,8 +33,10 @@ _FAR: Final = 1.0
 """Standard deviations of the prior that a coordinate moves in the first round at most."""
 _FARTHER: Final = 4.0
 """Times as far in the next round, where a whole move was a gain."""
-STEP: Final = 0.1
+_STEP: Final = 0.1
 """Of the differences, in standard deviations of a coordinate's prior."""
+_NARROW: Final = 0.5
+"""The same in those of its posterior beside the unknowns that are integrated out, at most."""
 _DENSE: Final = 12
 """Shared coordinates up to which second differences between two of them are taken too."""
 _SLIGHT: Final = 0.01
@@ -148,7 +151,7 @@ def height_at(problem: Problem, x: np.ndarray, free: Around) -> tuple[np.ndarray
 
 
 def _inner(
-    problem: Problem, x: np.ndarray, tolerance: float = 1e-3, *, near: bool = False
+    problem: Problem, x: np.ndarray, tolerance: float = 1e-3, *, near: System | None = None
 ) -> tuple[np.ndarray, Float[np.ndarray, " cluster"]]:
     """The point with what is integrated out, states or the clusters' own unknowns, at its mode, and V_c there."""
     bare = problem.with_volume(None)
@@ -168,21 +171,24 @@ class _Volumes:
     Args:
         problem: whose volume it is.
         x: the point.
-        index: positions of the fitted coordinates.
+        free: what is fitted.
     """
 
-    def __init__(self, problem: Problem, x: np.ndarray, index: Int[np.ndarray, " shared"]) -> None:
-        self._problem, self._index = problem, index
+    def __init__(self, problem: Problem, x: np.ndarray, free: Around) -> None:
+        self._problem, self._index = problem, free.index
         self._x, self.here = _inner(problem, x, _EXACT)
         self._own = activate(problem).local_index
-        self._follow = None if states(problem).blocks else following(problem, self._x, index)
+        bare = problem.with_volume(None)
+        self._follow = None if states(bare).blocks else following(bare, self._x, free.effects, free.index)
 
     def __call__(self, move: Float[np.ndarray, " shared"]) -> Float[np.ndarray, " cluster"]:
         moved = self._x.copy()
         moved[self._index] += move
-        if self._follow is not None:
-            moved[self._own] += self._follow @ move
-        return _inner(self._problem, moved, _EXACT, near=True)[1]
+        if self._follow is None:
+            return _inner(self._problem, moved, _EXACT)[1]
+        system, along = self._follow
+        moved[self._own] += along @ move
+        return _inner(self._problem, moved, _EXACT, near=system)[1]
 
     def beside(self, step: Float[np.ndarray, " shared"]) -> tuple[np.ndarray, np.ndarray]:
         """V_c (cluster, shared) a step up and a step down each coordinate."""
@@ -190,9 +196,20 @@ class _Volumes:
         return up, down
 
 
+def steps(free: Around, joint: Fit) -> Float[np.ndarray, " shared"]:
+    """How far apart differences of the volume are taken, so that the unknowns that are integrated out hardly turn.
+
+    Args:
+        free: what is fitted.
+        joint: a fit of it with what is integrated out.
+    """
+    place = np.searchsorted(joint.global_index, free.index)
+    return np.minimum(_STEP * free.scale, _NARROW * np.sqrt(np.diag(joint.covariance)[place]))
+
+
 def beside(problem: Problem, x: np.ndarray, free: Around, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """V_c (cluster, shared) a step up and a step down each fitted coordinate."""
-    return _Volumes(problem, x, free.index).beside(step)
+    return _Volumes(problem, x, free).beside(step)
 
 
 def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
@@ -200,15 +217,16 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
 
     Where a step down would lead below what a coordinate can be, the point about which it is looked at is a step above.
     """
-    step, at = STEP * free.scale, x.copy()
+    joint = fit(problem.with_volume(None), x, free.effects, steps=0)
+    step, at = steps(free, joint), x.copy()
     at[free.index] = np.maximum(x[free.index], free.lowest + step)
     n, units = len(step), np.diag(step)
-    volumes = _Volumes(problem, at, free.index)
+    volumes = _Volumes(problem, at, free)
     middle, (up, down) = volumes.here, volumes.beside(step)
     slope = (up - down) / 2
     bend = (up + down - 2 * middle[:, None])[:, :, None] * np.eye(n)
     straight = np.abs(np.nan_to_num(up + down - 2 * middle[:, None], posinf=0.0, neginf=0.0)).sum(axis=0)
-    for i, j in combinations(_bent(problem, x, free, straight / step**2) if n <= _DENSE else (), 2):
+    for i, j in combinations(_bent(problem, joint, free, straight / step**2) if n <= _DENSE else (), 2):
         both = sum(volumes(sign * (units[i] + units[j])) for sign in (1.0, -1.0))
         bend[:, i, j] = bend[:, j, i] = both / 2 - middle - (bend[:, i, i] + bend[:, j, j]) / 2
     value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
@@ -217,7 +235,7 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
     return Volume(free.index, at[free.index], value, slope / step, bend / np.outer(step, step))
 
 
-def _bent(problem: Problem, x: np.ndarray, free: Around, bend: np.ndarray) -> list[int]:
+def _bent(problem: Problem, joint: Fit, free: Around, bend: np.ndarray) -> list[int]:
     """The fitted coordinates along which the volume bends enough to matter; all of them beside states.
 
     Two that bend by a and b nats over their posteriors bend together by no more than the root of a b, where the volume
@@ -225,12 +243,11 @@ def _bent(problem: Problem, x: np.ndarray, free: Around, bend: np.ndarray) -> li
 
     Args:
         problem: whose volume it is.
-        x: where.
+        joint: a fit with what is integrated out.
         free: what is fitted.
         bend: size of the second derivative along each coordinate (shared,), over all clusters.
     """
     if len(free.index) < 2 or states(problem).blocks:
         return list(range(len(free.index)))
-    joint = fit(problem.with_volume(None), x, free.effects, steps=0)
     place = np.searchsorted(joint.global_index, free.index)
     return [int(i) for i in np.flatnonzero(bend * np.diag(joint.covariance)[place] > _SLIGHT)]

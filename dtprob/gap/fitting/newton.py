@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -44,6 +44,13 @@ class System:
     def finite(self) -> bool:
         """Whether a step can be told: far out a curvature may overflow where the log posterior does not."""
         return all((np.abs(part) < _ENDLESS).all() for part in vars(self).values())
+
+    @property
+    def own(self) -> System:
+        """The system of the local coordinates alone, the global ones held."""
+        return replace(
+            self, gradient=self.gradient[:0], curvature=self.curvature[:0, :0], cross=self.cross[:, :0]
+        )
 
 
 class NewtonStep(NamedTuple):

@@ -7,7 +7,7 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.gap.fitting.active import activate
-from dtprob.gap.fitting.density import curved, system_at, terms_of
+from dtprob.gap.fitting.density import cluster_terms, curved, system_at, terms_of
 from dtprob.gap.fitting.fit import fit
 from dtprob.gap.fitting.marginal import following, own_mode
 from dtprob.gap.model.problem import Problem
@@ -107,10 +107,26 @@ def test_own_modes_follow_what_is_shared(problem):
     active = activate(problem)
     x, _ = own_mode(problem, active, problem.null(), tolerance=1e-12)
     index = active.global_index
+    system, follow = following(problem, x, (), index)
     expected = []
     for sign in (1, -1):
         moved = x.copy()
         moved[index] += sign * 1e-4
-        expected.append(own_mode(problem, active, moved, tolerance=1e-14, near=True)[0][active.local_index])
-    follow = following(problem, x, index)[..., 0]
-    np.testing.assert_allclose(follow, (expected[0] - expected[1]) / 2e-4, atol=1e-3 * np.abs(follow).max())
+        expected.append(own_mode(problem, active, moved, tolerance=1e-14, near=system)[0][active.local_index])
+    told = follow[..., 0]
+    np.testing.assert_allclose(told, (expected[0] - expected[1]) / 2e-4, atol=1e-3 * np.abs(told).max())
+
+
+@pytest.mark.parametrize("far", [1e-3, 0.1, 0.3])
+def test_kept_curvatures_lead_to_the_same_mode(problem, far):
+    active = activate(problem)
+    x, _ = own_mode(problem, active, problem.null(), tolerance=1e-12)
+    system, _ = following(problem, x, (), active.global_index)
+    moved = x.copy()
+    moved[active.global_index] += far
+    by_kept, kept = own_mode(problem, active, moved, tolerance=1e-12, near=system, steps=200)
+    by_new, new = own_mode(problem, active, moved, tolerance=1e-12)
+    np.testing.assert_allclose(
+        cluster_terms(problem, active, by_kept), cluster_terms(problem, active, by_new), atol=1e-6
+    )
+    np.testing.assert_allclose(kept, new, rtol=1e-4, atol=1e-4 * np.abs(new).max())
