@@ -154,7 +154,7 @@ def _tried(evidence: Evidence) -> list[dict[str, Any]]:
 
 
 def _gap(evidence: Evidence) -> dict[str, Any]:
-    n = evidence.problem.n_observation
+    n = evidence.problem.observed.count
     best = evidence.floor.best
     before = (best - float(evidence.held_before.log_likelihood.sum())) / n
     after = (best - float(evidence.held_after.log_likelihood.sum())) / n if evidence.accepted else None
@@ -242,7 +242,7 @@ def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
         "nuisances": nuisances,
         "converged": fitted.converged,
         "n_clusters": problem.n_cluster,
-        "n_observations": problem.n_observation,
+        "n_observations": problem.observed.count,
         "warnings": list(evidence.notes),
     }
 

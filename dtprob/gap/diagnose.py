@@ -87,10 +87,10 @@ def diagnose(
             "Give more links, episodes or segments, or another cluster axis.",
         )
     shared = len(held(problem))
-    if shared >= problem.n_observation:
+    if shared >= problem.observed.count:
         raise InputError(
             f"latent sites without entries of their own for each of {problem.cluster_name!r}",
-            f"fewer unknowns than the {problem.n_observation} observed values",
+            f"fewer unknowns than the {problem.observed.count} observed values",
             str(shared),
             "Leave some out, or choose a cluster that has entries of its own.",
         )

@@ -36,7 +36,7 @@ def lost(problem: Problem, fitted: Fit, projection: Projection) -> Float[np.ndar
         return np.zeros(weights.shape[:2])
     rows = {}
     for name, slope in problem.compiled.bend(fitted.x, weights, along).items():
-        part, located = np.zeros((problem.components[name], *slope.shape)), problem.located[name]
+        part, located = np.zeros((problem.rows.components[name], *slope.shape)), problem.located[name]
         if located < len(part):
             part[located] = -np.asarray(slope)
         rows[name] = jnp.asarray(part)

@@ -40,7 +40,7 @@ def broken(problem: Problem, starts: Sequence[np.ndarray]) -> InputError:
     """
     what = f"base model {problem.declaration.name}"
     for name, site in problem.declaration.observed.items():
-        bad = ~np.isfinite(np.asarray(problem.observed_values[name]))
+        bad = ~np.isfinite(np.asarray(problem.observed.values[name]))
         if bad.any():
             argument = site.argument or name
             return InputError(
@@ -77,7 +77,7 @@ def check_noise(problem: Problem, fitted: Fit) -> None:
         if not {"loc", "scale"} <= observed.parameters.keys() or observed.family == "LogNormal":
             continue  # of another unit than the values
         loc, scale = (np.asarray(observed.parameters[n]) for n in ("loc", "scale"))
-        seen = np.asarray(problem.observed_values[name])
+        seen = np.asarray(problem.observed.values[name])
         rounding = _VANISHED * (float(np.median(np.abs(seen))) or 1.0)  # what is 0 throughout has no unit
         if np.all(scale < rounding) and np.median(np.abs(seen - loc)) < 100 * rounding:
             raise InputError(

@@ -36,7 +36,7 @@ def states(problem: Problem) -> Active:
     shared = [b for b in active.blocks if not b.local]
     if active.local_index.shape[1]:
         return replace(active, blocks=())
-    many = sum(b.size for b in shared) >= _MANY * problem.n_observation
+    many = sum(b.size for b in shared) >= _MANY * problem.observed.count
     chosen = (
         b.name in problem.decentred or (many and b.size >= _LARGE and sites[b.name].distribution in _NORMAL)
         for b in shared

@@ -53,7 +53,7 @@ def calibration(problem: Problem, folds: Iterable[Fold]) -> Calibration:
         problem: on whose data the fits were made.
         folds: which clusters were left out, and the fits to the others.
     """
-    located = problem.rows.is_location & (problem.in_rows(problem.counted) > 0)
+    located = problem.rows.is_location & (problem.rows.of_entries(problem.observed.counted) > 0)
     inside, squares = [], []
     families: set[str] = set()
     for held, part, _ in folds:
@@ -130,7 +130,7 @@ def _swing(problem: Problem, unknown: np.ndarray, held: np.ndarray) -> np.ndarra
     rows = np.zeros((problem.n_cluster, unknown.shape[1]))
     rows[held] = (unknown**2).sum(-1)
     found = {}
-    for name, own in problem.by_observation(rows).items():
+    for name, own in problem.rows.by_site(rows).items():
         scale, spread = likelihood(problem.families[name]).log_scale, problem.located[name]
         swing = (
             np.zeros_like(own)

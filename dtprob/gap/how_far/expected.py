@@ -37,5 +37,5 @@ def expected_loss(problem: Problem, x: np.ndarray) -> Float[np.ndarray, " cluste
         return jax.lax.fori_loop(1, _DRAWS, add, loss(keys[0]))
 
     sums = Hoisted(total, jax.jit)(jax.random.split(jax.random.key(0), _DRAWS))
-    each = {n: np.asarray(sums[n]) / (_DRAWS * k) for n, k in problem.components.items()}
-    return problem.in_rows(each).sum(1)
+    each = {n: np.asarray(sums[n]) / (_DRAWS * k) for n, k in problem.rows.components.items()}
+    return problem.rows.of_entries(each).sum(1)

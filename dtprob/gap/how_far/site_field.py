@@ -85,7 +85,7 @@ def field_of(problem: Problem, name: str, suspect: Suspect, *, positive: bool) -
             value, step(p[_UNIT] * p[FIELD]), positive=positive
         )
     else:
-        seen = problem.observed_values[suspect.site]
+        seen = problem.observed.values[suspect.site]
         distributions[suspect.site] = lambda fn, p, _: _redistributed(
             fn, suspect, step(p[_UNIT] * p[FIELD]), seen
         )

@@ -39,6 +39,6 @@ def bending(runner: Runner) -> Callable[[Any, Any, Any, Arrays], dict[str, jax.A
 
             return jnp.sum(jax.lax.map(lambda one: along(*one), (basis, jnp.moveaxis(weights, -1, 0))))
 
-        return jax.grad(total)({name: jnp.zeros(shape[1:]) for name, shape in runner.shapes.items()})
+        return jax.grad(total)({name: jnp.zeros(shape[1:]) for name, shape in runner.rows.shapes.items()})
 
     return lambda x, weights, basis, arrays: bend(jnp.asarray(x), weights, basis, arrays)

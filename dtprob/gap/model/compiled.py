@@ -47,7 +47,7 @@ class Compiled:
         rows = {}
         for name, observed in self._runner.around(found.parameters).items():
             density = whiten.log_prob(observed, found.values[name])
-            rows[name] = jnp.zeros(self._runner.shapes[name]).at[0].set(density)
+            rows[name] = jnp.zeros(self._runner.rows.shapes[name]).at[0].set(density)
         return Terms(self._runner.rows.stack(rows).sum(1), found.prior, found.local)
 
     @cached_property

@@ -25,7 +25,7 @@ def conditioned(problem: Problem, x: np.ndarray) -> frozenset[str]:
     names, rng = problem.declaration.deterministic, np.random.default_rng(0)
     before = {n: np.asarray(v) for n, v in problem.compiled.sites(x).items() if n in names}
     found: set[str] = set()
-    for argument in sorted(problem.responses):
+    for argument in sorted(problem.observed.arguments):
         own = np.asarray(problem.data[argument])
         drawn = rng.choice(own.reshape(-1), own.size).reshape(own.shape)
         moved = {n for n, m in _moved(problem, x, before, {argument: drawn}).items() if m.any()} - found

@@ -44,7 +44,7 @@ def misses(runner: Runner, found: Outcome, data: Data) -> dict[str, Miss]:
     for name, measure in metadata(runner.declared.model).measures.items():
         one = observed[measure.site]
         predicted, seen = measure.numbers(sites, data)
-        shape = runner.shapes[measure.site][1:]
+        shape = runner.rows.shapes[measure.site][1:]
         excess = jnp.broadcast_to(jnp.asarray(predicted - seen, float), shape)
         count = _by_cluster(runner, measure.site, one.masked(jnp.ones(shape)))
         mean = _by_cluster(runner, measure.site, one.masked(excess)) / jnp.maximum(count, 1.0)
@@ -74,5 +74,5 @@ def _entries(
 
 def _by_cluster(runner: Runner, name: str, entries: jax.Array) -> jax.Array:
     """Sums (cluster,) of one site's entries."""
-    rows: Mapping[str, jax.Array] = {n: jnp.zeros(shape) for n, shape in runner.shapes.items()}
+    rows: Mapping[str, jax.Array] = {n: jnp.zeros(shape) for n, shape in runner.rows.shapes.items()}
     return runner.rows.stack({**rows, name: rows[name].at[0].set(entries)}).sum(1)

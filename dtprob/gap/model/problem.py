@@ -25,11 +25,10 @@ from dtprob.gap.model.compiled import Compiled
 from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import Block, Known, Layout, make_layout, normal_of
+from dtprob.gap.model.observed import Observed
 from dtprob.gap.model.own import Own
 from dtprob.gap.model.prior import Prior
 from dtprob.gap.model.programs import Programs
-from dtprob.gap.model.quick import quick_jit
-from dtprob.gap.model.responses import counted, responses
 from dtprob.gap.model.rows import Rows, make_rows
 from dtprob.gap.model.running import Arrays, Runner
 from dtprob.gap.model.shapes import latent_shapes, observed_shapes, perturbed_sites, shapes_of_fields
@@ -107,6 +106,7 @@ class Problem:
         self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
         self._declared = Declared(model, self.declaration, static)
         self._prior = Prior(self._declared)
+        self.observed = Observed(self._declared, self.arrays)
 
     def _find_own(self) -> None:
         """Ask the model, in which nothing counts as a cluster's own at first, what is."""
@@ -124,7 +124,7 @@ class Problem:
         self.rows: Rows = make_rows(
             self.declaration, shapes, self.located, self.data, self.column, joint=joint
         )
-        self._row_shapes, self._families = shapes, families
+        self._families = families
         self._lay_out()
 
     def _lay_out(self) -> None:
@@ -136,7 +136,6 @@ class Problem:
             self.live,
             self.layout,
             self.rows,
-            self._row_shapes,
             self._families,
             self.own,
             frozenset(name for names in self.known for name in names),
@@ -244,38 +243,6 @@ class Problem:
         """Length of the flat vector."""
         return self.layout.dimension
 
-    @cached_property
-    def counted(self) -> dict[str, np.ndarray]:
-        """Which entries of each observed site no mask leaves out."""
-        return counted(self._declared, self.arrays)
-
-    @property
-    def n_observation(self) -> int:
-        """Observed entries that count, a complex one once."""
-        return sum(int(entries.sum()) for entries in self.counted.values())
-
-    def in_rows(self, entries: Mapping[str, np.ndarray]) -> np.ndarray:
-        """Entries of each observed site (*site) as rows (cluster, row), the same in each of their rows."""
-        count = self.components
-        return np.asarray(
-            self.rows.stack({n: jnp.asarray(np.stack([entries[n]] * k)) for n, k in count.items()})
-        )
-
-    @property
-    def components(self) -> dict[str, int]:
-        """Whitened rows per entry of each observed site."""
-        return {name: shape[0] for name, shape in self._runner.shapes.items()}
-
-    def by_observation(self, rows: np.ndarray) -> dict[str, np.ndarray]:
-        """Rows (..., component, *site) of each observed site, from those of all (..., cluster, row)."""
-        flat, start, found = self.rows.unstack(rows), 0, dict[str, np.ndarray]()
-        for name, count in self.components.items():
-            site = self.declaration.observed[name]
-            stop = start + count * site.size
-            found[name] = flat[..., start:stop].reshape(*flat.shape[:-1], count, *site.shape)
-            start = stop
-        return found
-
     @property
     def families(self) -> Mapping[str, str]:
         """Distribution family of each observed site."""
@@ -289,23 +256,8 @@ class Problem:
     @property
     def n_observation_of_each(self) -> np.ndarray:
         """Observed entries of each cluster that count (cluster,)."""
-        return self.in_rows({n: self.counted[n] / k for n, k in self.components.items()}).sum(1)
-
-    @cached_property
-    def responses(self) -> frozenset[str]:
-        """Arguments of the model that tell what was observed."""
-        return responses(self._declared, self.arrays)
-
-    @cached_property
-    def observed_values(self) -> dict[str, jax.Array]:
-        """The data of each observed site."""
-
-        @quick_jit
-        def run(arrays: Any) -> dict[str, jax.Array]:
-            trace = self._declared.trace(arrays)
-            return {name: jnp.asarray(trace[name]["value"]) for name in self.declaration.observed}
-
-        return run(self.arrays)
+        counted, rows = self.observed.counted, self.rows
+        return rows.of_entries({n: counted[n] / k for n, k in rows.components.items()}).sum(1)
 
     def blocks_of(self, owner: str | None) -> list[Block]:
         """The blocks of a live effect by its name, or of the base model's nuisances."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from functools import cached_property
@@ -26,6 +27,7 @@ class Rows:
         located: 1 for rows that stand for a location or probability, 0 for a spread.
         gather: (cluster, row) positions of each cluster's rows; the position after the last stands for padding.
         cluster_name: the axis or column of the clusters.
+        shapes: (component, *site) of each observed site's rows.
     """
 
     ids: np.ndarray
@@ -33,6 +35,7 @@ class Rows:
     located: np.ndarray
     gather: np.ndarray
     cluster_name: str
+    shapes: Mapping[str, tuple[int, ...]]
 
     @cached_property
     def is_location(self) -> np.ndarray:
@@ -58,6 +61,25 @@ class Rows:
         flat = np.zeros((*rows.shape[:-2], len(self.ids) + 1), rows.dtype)
         flat[..., self.gather] = rows
         return flat[..., :-1]
+
+    @property
+    def components(self) -> dict[str, int]:
+        """Rows per entry of each observed site."""
+        return {name: shape[0] for name, shape in self.shapes.items()}
+
+    def by_site(self, rows: np.ndarray) -> dict[str, np.ndarray]:
+        """Rows (..., component, *site) of each observed site, from those of all (..., cluster, row)."""
+        flat, start, found = self.unstack(rows), 0, dict[str, np.ndarray]()
+        for name, shape in self.shapes.items():
+            stop = start + math.prod(shape)
+            found[name] = flat[..., start:stop].reshape(*flat.shape[:-1], *shape)
+            start = stop
+        return found
+
+    def of_entries(self, entries: Mapping[str, np.ndarray]) -> np.ndarray:
+        """Entries of each observed site (*site) as rows (cluster, row), the same in each of their rows."""
+        whole = {n: np.broadcast_to(entries[n], shape) for n, shape in self.shapes.items()}
+        return np.concatenate([*(value.reshape(-1) for value in whole.values()), [0]])[self.gather]
 
     def by_cluster(self, values: np.ndarray) -> np.ndarray:
         """A flat per-row array as (cluster, row), padded with -1."""
@@ -113,7 +135,8 @@ def make_rows(
     found = np.concatenate(ids)
     name = column or declaration.cluster or "row"
     joined = {axis: np.concatenate(parts) for axis, parts in coordinates.items()}
-    return Rows(found, joined, np.concatenate(marks).astype(int), _gather_index(found), name)
+    marked = np.concatenate(marks).astype(int)
+    return Rows(found, joined, marked, _gather_index(found), name, dict(shapes))
 
 
 def _labels(column: np.ndarray) -> np.ndarray:

@@ -67,7 +67,6 @@ class Runner:
         live: effects whose parameters are coordinates.
         layout: where each latent site and parameter lies in the flat vector.
         rows: the whitened rows of the observations.
-        shapes: (component, *site shape) of each observed site's rows.
         families: the distribution family of each observed site.
         own: which latent sites have entries for each cluster.
         known: nuisances that earlier data inform instead of the prior.
@@ -77,7 +76,6 @@ class Runner:
     live: tuple[Effect, ...]
     layout: Layout
     rows: Rows
-    shapes: Mapping[str, tuple[int, ...]]
     families: Mapping[str, str]
     own: Mapping[str, Own]
     known: frozenset[str]

@@ -60,5 +60,5 @@ def _is_within(shape: tuple[int, ...], wide: tuple[int, ...]) -> bool:
 def _given(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
     """The arrays of the data, but for what tells what was observed."""
     for name, values in problem.data.items():
-        if name not in problem.responses and eqx.is_array_like(values):
+        if name not in problem.observed.arguments and eqx.is_array_like(values):
             yield name, np.asarray(values)

@@ -97,7 +97,7 @@ def differences(problem: Problem, drawn: Replicates) -> tuple[Differences, ...]:
     if all(weight is None for weight in weights.values()):
         return ()
     found: list[Differences] = []
-    for name, rows in problem.by_observation(drawn.rows).items():
+    for name, rows in problem.rows.by_site(drawn.rows).items():
         site, weight = problem.declaration.observed[name], weights[name]
         if weight is None:
             continue

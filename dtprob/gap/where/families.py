@@ -149,7 +149,7 @@ def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients
 
 def observed(problem: Problem, rows: np.ndarray) -> Iterator[Site]:
     """Spreads of what is observed, from projected rows (n, cluster, row); locations too where the model names no site."""
-    for name, own in problem.by_observation(rows).items():
+    for name, own in problem.rows.by_site(rows).items():
         site, count = problem.declaration.observed[name], own.shape[1]
         located = problem.located[name]
         complex_parts = 2 if likelihood(problem.families[name]).is_complex else 1
@@ -170,7 +170,7 @@ def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> n
     for i in range(len(steps)):
         rows = {
             n: np.zeros((count, *problem.declaration.sites[n].shape))
-            for n, count in problem.components.items()
+            for n, count in problem.rows.components.items()
         }
         for place, part in zip(site.rows, parts, strict=False):
             rows[site.name][place] = part[i]

@@ -58,7 +58,7 @@ def further_moments(
         rows: projected ones (n, cluster, row), of the data first.
     """
     families = {name: likelihood(family) for name, family in problem.families.items()}
-    every, observations = problem.by_observation(rows), problem.compiled.observations(x)
+    every, observations = problem.rows.by_site(rows), problem.compiled.observations(x)
     looked = {
         name: own[:, :1] + 1j * own[:, 1:2] if families[name].is_complex else own[:, : problem.located[name]]
         for name, own in every.items()

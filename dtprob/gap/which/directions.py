@@ -176,7 +176,7 @@ def _distribution_tangents(
     null, extra = null_vector(effect), []
     base_rows: list[dict[str, jax.Array]] = [{} for _ in range(len(null))]
     for site, observation in around.observations.items():
-        shape = (around.problem.components[site], *around.problem.declaration.sites[site].shape)
+        shape = (around.problem.rows.components[site], *around.problem.declaration.sites[site].shape)
         rewrite = effect.distributions.get(site)
         if rewrite is None:
             for rows in base_rows:

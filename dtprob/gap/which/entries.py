@@ -127,7 +127,7 @@ class Trials:
             points[:, j] = offsets
             counts.append(_count(self(self._everywhere(points))[0]))
         spacing = 2 * _REACH * spread / np.maximum(np.array(counts) - 1, 1)
-        most = min(_TRIALS, max(_WORK // (self.problem.n_observation * len(self._turns)), _LINE))
+        most = min(_TRIALS, max(_WORK // (self.problem.observed.count * len(self._turns)), _LINE))
         while np.prod(counts) > most:
             counts[int(np.argmax(counts))] -= 2
         lines = [step * np.arange(-(n // 2), n // 2 + 1) for n, step in zip(counts, spacing, strict=True)]

@@ -217,7 +217,7 @@ def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, fou
     located = np.maximum(problem.rows.by_cluster(problem.rows.located), 0.0)
     of_location = np.einsum("cmi,cmi,cm->i", found.columns, found.columns, located)
     u = _products(projection.adjoint(drawn.raw), found)
-    values = problem.observed_values
+    values = problem.observed.values
     for effect, group in zip(found.effects, found.groups, strict=True):
         for extra in found.extra[effect.name]:
             own = extra.shift.T @ extra.shift

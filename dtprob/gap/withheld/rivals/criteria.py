@@ -51,7 +51,7 @@ def bic(problem: Problem, fitted: Fit) -> Float[np.ndarray, " 1"]:
     fields = tuple(e.name for e in chosen if e.kind == "variance")
     size = sum(e.dimension for e in chosen)
     held = fitting.fit(problem, fitted.x, fields, spread=fitted.spread, steps=0)
-    return np.array([held.log_evidence - 0.5 * size * np.log(problem.n_observation)])
+    return np.array([held.log_evidence - 0.5 * size * np.log(problem.observed.count)])
 
 
 def _root(matrix: np.ndarray) -> np.ndarray:

@@ -88,7 +88,7 @@ def _features(problem: Problem, length: float) -> np.ndarray:
     """Random Fourier features (cluster, row, feature) of unit variance at every location, each component its own."""
     rng, located = np.random.default_rng(0), _located(problem)
     parts, most = [], max(located.values())
-    for site, components in problem.components.items():
+    for site, components in problem.rows.components.items():
         x = inputs(problem, site)
         frequency = rng.standard_normal((x.shape[-1], _FEATURES)) / (length * np.sqrt(max(x.shape[-1], 1)))
         wave = np.sqrt(2 / _FEATURES) * np.cos(x @ frequency + rng.uniform(0, 2 * np.pi, _FEATURES))
@@ -103,7 +103,7 @@ def _features(problem: Problem, length: float) -> np.ndarray:
 def _located(problem: Problem) -> dict[str, int]:
     """How many components of each observed site stand for its location; they come first."""
     found, low = {}, 0
-    for site, components in problem.components.items():
+    for site, components in problem.rows.components.items():
         size = problem.declaration.sites[site].size
         marks = problem.rows.located[low : low + components * size].reshape(components, -1)
         found[site], low = int(marks[:, 0].sum()), low + components * size
@@ -122,7 +122,7 @@ def inputs(problem: Problem, site: str) -> Float[np.ndarray, "*site input"]:
     """
     shape = problem.declaration.sites[site].shape
     columns = [np.broadcast_to(g, shape) for g in np.indices(shape, dtype=float)]
-    observed = [np.asarray(v) for v in problem.observed_values.values()]
+    observed = [np.asarray(v) for v in problem.observed.values.values()]
     for value in problem.data.values():
         array = np.asarray(value) if hasattr(value, "shape") else np.zeros(())
         if np.iscomplexobj(array) or any(

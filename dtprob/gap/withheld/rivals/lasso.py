@@ -53,7 +53,7 @@ def lasso(seen: Look) -> Claim:
     if not len(features.owner):
         return Claim(1.0, (), seen.names)
     largest = np.where(features.positive, features.score, np.abs(features.score)).max(axis=1)
-    score, n = features.score[0], seen.problem.n_observation
+    score, n = features.score[0], seen.problem.observed.count
     knots = list(path(score, features.correlation, features.positive))
     best = min(knots, key=lambda b: extended_bic(b != 0, score, features.correlation, n))
     weight = np.zeros(len(seen.effects))

@@ -80,7 +80,7 @@ def forward(seen: Look, criterion: Criterion, key: jax.Array, settings: Settings
         key: of the replicates at later fits.
         settings: how many candidates are refitted at each step, and the largest set.
     """
-    penalty = criterion.penalty(seen.size, seen.problem.n_observation)
+    penalty = criterion.penalty(seen.size, seen.problem.observed.count)
     margin = seen.gain - penalty
     p_value = chance(margin.max(axis=1, initial=-np.inf))
     ranking = [seen.names[i] for i in np.argsort(-margin[0], kind="stable")]

@@ -309,7 +309,7 @@ def test_masked_readings_are_no_hits():
     fitted = fitting.fit(problem, problem.null())
     found = calibration(problem, list(closed.fold_fits(problem, fitted, closed.folds(40, 4))))
     scaled = ((y - fitted.x[0] * x) / SIGMA)[seen]
-    assert problem.n_observation == seen.sum()
+    assert problem.observed.count == seen.sum()
     np.testing.assert_allclose(problem.n_observation_of_each, seen.sum(1))
     assert found.coverage == pytest.approx(np.mean(np.abs(scaled) < 1.645), abs=0.02)
     assert found.error_ratio == pytest.approx(np.sqrt(np.mean(scaled**2)), rel=0.02)

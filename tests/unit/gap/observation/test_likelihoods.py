@@ -182,4 +182,4 @@ def test_what_tells_the_outcome_explains_nothing():
     y = np.maximum(-distance + rng.standard_normal(40), -2.0)
     data = {"distance": distance, "censored": y <= -2.0, "y": y, "power": np.exp(rng.standard_normal(40))}
     data = {name: jnp.asarray(value) for name, value in data.items()}
-    assert Problem(model, data, ()).responses == {"censored", "y", "power"}
+    assert Problem(model, data, ()).observed.arguments == {"censored", "y", "power"}

@@ -126,7 +126,7 @@ def test_a_table_of_features_is_looked_along_whole(problem):
     wide = SimpleNamespace(
         declaration=problem.declaration,
         data={"features": rng.normal(size=(LENGTH, 7))},
-        responses=problem.responses,
+        observed=problem.observed,
     )
     labels = {c.label for c in curves(wide, "row", LENGTH)}
     assert {f"along features[{i}]" for i in range(7)} <= labels
@@ -135,7 +135,7 @@ def test_a_table_of_features_is_looked_along_whole(problem):
 def test_real_numbers_that_repeat_are_looked_at_by_value_too(problem):
     receiver = np.repeat(np.arange(8.0), 10)
     named = SimpleNamespace(
-        declaration=problem.declaration, data={"receiver": receiver}, responses=problem.responses
+        declaration=problem.declaration, data={"receiver": receiver}, observed=problem.observed
     )
     found = {c.label: c for c in curves(named, "row", 80)}
     assert found["by receiver"].extent == (8, 80)
@@ -160,7 +160,7 @@ def test_columns_of_a_grid_are_looked_over_together(problem):
     named = SimpleNamespace(
         declaration=problem.declaration,
         data={"east": grid[:, 0], "north": grid[:, 1]},
-        responses=problem.responses,
+        observed=problem.observed,
     )
     labels = {c.label for c in curves(named, "row", len(grid))}
     assert {"over east and north", "near a place of east and north", "by east", "along east"} <= labels
@@ -175,7 +175,7 @@ def test_what_is_known_of_each_entry_is_no_table_of_features(problem):
             sites=problem.declaration.sites,
         ),
         data={"weight": np.random.default_rng(7).normal(size=shape)},
-        responses=problem.responses,
+        observed=problem.observed,
     )
     assert not any("weight" in c.label for c in curves(both, "row", LENGTH))
 
@@ -194,7 +194,9 @@ def test_a_band_of_ripples_is_called_by_its_half_waves(problem):
 def test_a_column_of_an_axis_name_stands_for_its_positions(problem):
     place = np.random.default_rng(5).uniform(size=LENGTH)
     named = SimpleNamespace(
-        declaration=problem.declaration, data={**problem.data, "row": place}, responses=problem.responses
+        declaration=problem.declaration,
+        data={**problem.data, "row": place},
+        observed=problem.observed,
     )
     labels = [c.label for c in curves(named, "row", LENGTH)]
     assert len(labels) == len(set(labels))

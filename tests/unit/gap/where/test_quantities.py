@@ -81,7 +81,7 @@ def test_columns_that_are_broadcast_lie_on_the_observations_axes():
     seen, name = np.zeros((2, 8, 6)), "shut"
     for shape, found in (((8, 6), True), ((2, 1, 6), True), ((1, 6), True), ((8, 5), False), ((6,), False)):
         column = np.arange(np.prod(shape)).reshape(shape)
-        problem = SimpleNamespace(data={name: column}, responses=frozenset())
+        problem = SimpleNamespace(data={name: column}, observed=SimpleNamespace(arguments=frozenset()))
         got = whole_columns(problem, SimpleNamespace(shape=seen.shape))
         assert (name in got) == found
         if found:
@@ -92,7 +92,9 @@ def pairs(**columns):
     size = len(next(iter(columns.values())))
     observed = {"y": SimpleNamespace(axes=("row",), shape=(size,))}
     declaration = SimpleNamespace(observed=observed)
-    problem = SimpleNamespace(data=columns, responses=frozenset(), declaration=declaration)
+    problem = SimpleNamespace(
+        data=columns, observed=SimpleNamespace(arguments=frozenset()), declaration=declaration
+    )
     return {found.label: found.values for found in curves(problem, "row", size)}
 
 
