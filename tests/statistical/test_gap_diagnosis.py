@@ -18,6 +18,7 @@ from dtprob.gap import diagnose as diagnosing
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting import integrated
 from dtprob.gap.fitting.fit import fit
+from dtprob.gap.model.observed import Observed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.which.confirm import confirm
@@ -67,7 +68,7 @@ def shared_compilation():
         problem.data, problem.arrays = dict(data), split_static(data)[0]
         problem.programs._arrays = problem.arrays
         problem.compiled.arrays = problem.compiled.arrays._replace(data=problem.arrays)
-        problem.__dict__.pop("observed_values", None)
+        problem.observed = Observed(problem._declared, problem.arrays)
         return problem
 
     def key_of(model, data, effects, cluster, live=()):

@@ -32,6 +32,7 @@ class Replicates:
         raw: rows of the data (cluster, row), as if nothing had been fitted.
         rows: projected rows of the data and of the first replicates (1 + replicate, cluster, row).
         gradients: site gradients of the same, (1 + replicate, *site) by site.
+        together: how many of these replicates go through a program at once; see `parts`.
     """
 
     problem: Problem
@@ -41,6 +42,7 @@ class Replicates:
     raw: np.ndarray
     rows: np.ndarray
     gradients: Mapping[str, jax.Array]
+    together: int
 
     @property
     def at_sites(self) -> int:
@@ -51,6 +53,12 @@ class Replicates:
         """How many times more replicates can be taken to the sites, at most `times`; fewer where the sites are large."""
         entries = sum(g[0].size for g in self.gradients.values())
         return int(min(_MOST_VALUES / (max(self.at_sites, 1) * max(entries, 1)), times))
+
+    def parts(self) -> Iterator[dict[str, jax.Array]]:
+        """Site gradients of the data and of some replicates at a time, (1 + `together`, *site) by site."""
+        for low in range(1, len(self.rows), self.together):
+            index = np.array([0, *range(low, low + self.together)])
+            yield {name: gradient[index] for name, gradient in self.gradients.items()}
 
     def site_gradients(self, rows: np.ndarray) -> dict[str, jax.Array]:
         """Gradients (n, *site) by site of projected rows (n, cluster, row)."""
@@ -78,7 +86,9 @@ def replicate(
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
     rows = np.concatenate([observed[None], projected])
     gradients = _site_gradients(problem, fitted, projection, rows)
-    return Replicates(problem, fitted, projection, keys, raw, rows, gradients)
+    return Replicates(
+        problem, fitted, projection, keys, raw, rows, gradients, together=max(len(projected), 1)
+    )
 
 
 def observed_rows(problem: Problem, fitted: Fit, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
@@ -118,7 +128,7 @@ def more(drawn: Replicates, times: int) -> Replicates:
         n: jnp.asarray(np.concatenate([np.asarray(g)[:1], *(np.asarray(part[n])[1:] for part in parts)]))
         for n, g in drawn.gradients.items()
     }
-    return replace(drawn, rows=np.concatenate([observed, projected]), gradients=gradients)
+    return replace(drawn, rows=np.concatenate([observed, projected]), gradients=gradients, together=first)
 
 
 def normal_like(drawn: Replicates) -> tuple[np.ndarray, dict[str, np.ndarray]]:

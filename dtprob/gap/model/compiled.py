@@ -249,7 +249,7 @@ class Compiled:
         for start in range(0, n, CHUNK):
             chunk = dict(self._nowhere)
             for name, given in deltas.items():
-                chunk[name] = _filled(np.asarray(given[start : start + CHUNK]), self._nowhere[name])
+                chunk[name] = _filled(given[start : start + CHUNK], self._nowhere[name])
             yield chunk
 
     @cached_property
@@ -339,8 +339,10 @@ def _replicate(
     return jax.lax.map(one, keys)
 
 
-def _filled(given: np.ndarray, like: jax.Array) -> jax.Array:
+def _filled(given: Any, like: jax.Array) -> jax.Array:
     """Perturbations of one site (n, ...) as one whole chunk."""
+    if given.shape == like.shape:
+        return jnp.asarray(given, like.dtype)
     part = np.zeros(like.shape, like.dtype)
     part[: len(given)] = given
     return jnp.asarray(part)

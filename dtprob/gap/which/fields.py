@@ -11,7 +11,12 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from dtprob.gap.tails import family_wise, field_log_bayes_factor, gamma_tail
+from dtprob.effects.effect import Effect
+from dtprob.gap.fitting.bootstrap import Replicates
+from dtprob.gap.model.problem import Problem
+from dtprob.gap.tails import deviation, family_wise, field_log_bayes_factor, gamma_tail
+from dtprob.gap.which.directions import Surroundings
+from dtprob.gap.which.places import Placed
 
 _SPREADS: Final = np.geomspace(1e-2, 1e3, 51)
 """Spreads that are tried, in units of what a weight of middling information is known to."""
@@ -33,6 +38,34 @@ class FieldTests(NamedTuple):
     z: Float[np.ndarray, " effect"]
     log_bayes_factor: Float[np.ndarray, " effect"]
     replicates: Float[np.ndarray, "replicate effect"]
+
+
+def tests_of_fields(
+    problem: Problem,
+    around: Surroundings,
+    fields: Sequence[Effect],
+    drawn: Replicates,
+    placed: Mapping[str, Placed],
+) -> FieldTests:
+    """Test variance effects, those that may act anywhere where they were found.
+
+    Args:
+        problem: the model and candidates on their data.
+        around: the fit.
+        fields: the effects.
+        drawn: the data and replicates there.
+        placed: how the places of effects that may act anywhere were found, by name.
+    """
+    energy: dict[str, np.ndarray] = {}
+    for part in drawn.parts() if fields else ():
+        found = problem.programs.field_energy(around.grown(), part, fields)
+        energy = {n: np.concatenate([energy[n], e[1:]]) if energy else e for n, e in found.items()}
+    tested = field_tests(energy, [e.name for e in fields], drawn.at_sites)
+    for k, found in ((k, placed[e.name]) for k, e in enumerate(fields) if e.name in placed):
+        tested.smallest[k] = tested.p_value[k] = found.p_value
+        tested.replicates[:, k], tested.z[k] = 1.0, deviation(found.p_value, one_sided=True)
+        tested.log_bayes_factor[k] -= found.price
+    return tested
 
 
 def field_tests(

@@ -174,7 +174,8 @@ def test_inputs_of_a_process():
     data = {"x": jnp.asarray(x), "y": jnp.asarray(x + 1), "constant": jnp.ones(len(x)), "power": 3.0}
     site = SimpleNamespace(shape=x.shape)
     declared = SimpleNamespace(sites={"y": site})
-    found = inputs(SimpleNamespace(declaration=declared, observed_values={"y": data["y"]}, data=data), "y")
+    observed = SimpleNamespace(values={"y": data["y"]})
+    found = inputs(SimpleNamespace(declaration=declared, observed=observed, data=data), "y")
     assert found.shape == (*x.shape, 3)
     np.testing.assert_allclose(found.std(axis=(0, 1)), 1.0)
     assert np.corrcoef(found[..., 2].ravel(), x.ravel())[0, 1] == pytest.approx(1.0)
