@@ -164,9 +164,11 @@ def apart(name: str, size: Size, estimates: Sequence[float | None]) -> str:
 
 
 def shares(interval: Interval) -> str:
-    """An interval of shares: `88 to 97%`."""
+    """An interval of shares: `88 to 97%`; from nothing on, unless all of it is below."""
     low, high = interval["low"], interval["high"]
-    return f"{percent(low if low is None else max(low, 0.0)).rstrip('%')} to {percent(high)}"
+    if low is not None and high is not None and high > 0:
+        low = max(low, 0.0)
+    return f"{percent(low).rstrip('%')} to {percent(high)}"
 
 
 def significant[Located: (Site, Coordinates)](located: Iterable[Located]) -> list[Located]:
@@ -254,6 +256,8 @@ def _stem(name: str, size: Size) -> str:
     """The key of a size without the unit at its end: `delay_s`, `velocity_m_per_s`."""
     if "unit" not in size:
         return split_unit(name)[0]
+    if size["unit"] == "1":  # a number at the end is an entry's
+        return name
     unit = size["unit"].replace("/", "_per_").replace("^", "").replace(" ", "_")
     return name[: -len(unit) - 1] if name.lower().endswith(f"_{unit.lower()}") else name
 

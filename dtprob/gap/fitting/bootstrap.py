@@ -136,9 +136,9 @@ def normal_like(drawn: Replicates) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
     Rare outcomes may be seen by no replicate; in these they have their share.
     """
-    key = jax.random.fold_in(drawn.keys[0], 1)
-    keys = jax.random.split(key, drawn.at_sites)
-    rows = np.asarray(jax.random.normal(key, (drawn.at_sites, *drawn.raw.shape)))
+    of_noise, of_prior = jax.random.split(jax.random.fold_in(drawn.keys[0], 1))
+    keys = jax.random.split(of_prior, drawn.at_sites)
+    rows = np.asarray(jax.random.normal(of_noise, (drawn.at_sites, *drawn.raw.shape)))
     projected = drawn.projection.rows(drawn.projection.with_prior(rows, keys))
     found = drawn.site_gradients(np.concatenate([drawn.rows[:1], projected]))
     return projected, {name: np.asarray(g)[1:] for name, g in found.items()}
@@ -152,10 +152,17 @@ def _projected(problem: Problem, fitted: Fit, projection: Projection, keys: jax.
 def _portions(
     problem: Problem, fitted: Fit, projection: Projection, keys: jax.Array
 ) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
-    """Portions of one size are drawn, so that one program serves all; of the last one as much as there are keys."""
+    """Portions of one size are drawn, so that one program serves all; of the last one as much as there are keys.
+
+    Noise and the prior's draws have keys of their own: one that was split for the one and folded for the other would give
+    both the same numbers.
+    """
     place = np.arange(-(-len(keys) // _PORTION) * _PORTION).reshape(-1, _PORTION)
     for part in place:
-        own = keys[np.minimum(part, len(keys) - 1)]
-        rows, values = problem.compiled.replicate(fitted.x, own)
+        of_noise, of_prior = jax.vmap(jax.random.split, out_axes=1)(keys[np.minimum(part, len(keys) - 1)])
+        rows, values = problem.compiled.replicate(fitted.x, of_noise)
         count = int((part < len(keys)).sum())
-        yield projection.with_prior(np.asarray(rows), own)[:count], {n: v[:count] for n, v in values.items()}
+        yield (
+            projection.with_prior(np.asarray(rows), of_prior)[:count],
+            {n: v[:count] for n, v in values.items()},
+        )

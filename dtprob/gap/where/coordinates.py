@@ -16,6 +16,9 @@ from dtprob.gap.tails import LOG_SMALLEST, beyond_largest, gamma_log_tail, gamma
 LEVEL: Final = 0.01
 """Family-wise, of everything that is told of parts of the data."""
 
+_NEARLY_ALL: Final = 0.95
+"""Share of a block's excess from which a shorter one in it is told in its place."""
+
 
 @dataclass(frozen=True)
 class CoordinateFinding:
@@ -137,7 +140,18 @@ def _windows(size: int, *, ordered: bool) -> Iterator[tuple[np.ndarray, np.ndarr
 def _without_overlap(found: list[CoordinateFinding]) -> tuple[CoordinateFinding, ...]:
     """The strongest blocks of each axis, none overlapping a stronger one."""
     kept: list[CoordinateFinding] = []
-    for block in sorted(found, key=lambda b: (b.p_value, -b.excess / (b.high - b.low + 1))):
+    for strongest in sorted(found, key=lambda b: (b.p_value, -b.excess / (b.high - b.low + 1))):
+        block = _narrowed(strongest, found)
         if all(b.axis != block.axis or b.high < block.low or block.high < b.low for b in kept):
             kept.append(block)
     return tuple(kept[:12])
+
+
+def _narrowed(block: CoordinateFinding, found: list[CoordinateFinding]) -> CoordinateFinding:
+    """The shortest block within one that holds nearly all of its excess: p-values that are hardly 0 tell no length."""
+    inside = (b for b in found if b.axis == block.axis and block.low <= b.low and b.high <= block.high)
+    return min(
+        (b for b in inside if b.excess >= _NEARLY_ALL * block.excess),
+        key=lambda b: b.high - b.low,
+        default=block,
+    )

@@ -85,6 +85,7 @@ def test_sizes_drop_the_unit_of_their_key() -> None:
     assert names.size_reading("velocity_x_m_per_s", {**interval, "unit": "m/s"})[0] == "velocity x"
     assert names.size_reading("scale_rad_per_s0.5", {**interval, "unit": "rad/s^0.5"})[0] == "scale"
     assert names.size_reading("delay_s", interval)[0] == "delay"
+    assert names.size_reading("gps.metres_1", {**interval, "unit": "1"})[0] == "gps: metres 1"
 
 
 def test_a_logarithm_is_told_as_a_factor() -> None:
@@ -289,3 +290,8 @@ def test_effects_that_were_not_looked_for_any_more_are_told() -> None:
     assert tell(report).label == "Causes found, perhaps not all"
     report["unlisted"]["sites"] = ["y"]
     assert tell(report).label == "Cause found, but something is left"
+
+
+def test_shares_below_nothing_are_told_as_they_are() -> None:
+    assert names.shares({"low": -0.2, "high": 0.4}) == "0 to 40%"
+    assert names.shares({"low": -1.5, "high": -0.46}) == "\u2212150 to \u221246%"

@@ -116,3 +116,12 @@ def test_a_block_of_neighbours_that_stray_is_found(kind):
         found = rows_in_order(rows)
         hits += bool(found) and found[0].low >= 160 and found[0].high < 288
     assert hits >= stats.binom.ppf(1e-3, 10, 0.9)
+
+
+@pytest.mark.parametrize("place", [6, 7, 12])
+def test_one_strong_position_is_told_without_its_neighbour(place):
+    """Where p-values end, blocks of all lengths are as sure."""
+    rows = np.random.default_rng(0).normal(size=(100, 40))
+    rows[0, place] = 90.0
+    (found,) = rows_in_order(rows)
+    assert (found.low, found.high) == (place, place)
