@@ -17,7 +17,7 @@ import numpy as np
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.active import LOG_2PI, Active, activate
 from dtprob.gap.fitting.density import cluster_terms, curved, moved, rescored, system_at, value_of, volume_of
-from dtprob.gap.fitting.newton import NewtonStep, System, newton_step, positive
+from dtprob.gap.fitting.newton import NewtonStep, System, newton_step
 from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
 from dtprob.gap.model.problem import Problem
@@ -218,18 +218,12 @@ def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, conve
     system = system_at(problem, active, x)
     if not system.finite:
         return _hopeless(active, x)
-    local = positive(system.local)
-    schur = system.curvature
-    n_local = local.shape[-1]
-    evidence = value - volume_of(problem, active, x)  # told anew, not expanded
-    evidence += 0.5 * (len(active.global_index) + n_local * active.weights.sum()) * LOG_2PI
-    if n_local:
-        eliminated = np.linalg.solve(local, np.swapaxes(system.cross, 1, 2))
-        schur = schur - np.einsum("c,cij,cjk->ik", active.weights, system.cross, eliminated)
-        evidence -= 0.5 * float(active.weights @ np.linalg.slogdet(local)[1])
+    local, schur = system.eliminated()
     if not np.isfinite(schur).all():
         return _hopeless(active, x)
-    schur = positive(schur)
+    evidence = value - volume_of(problem, active, x)  # told anew, not expanded
+    evidence += 0.5 * (len(active.global_index) + local.shape[-1] * active.weights.sum()) * LOG_2PI
+    evidence -= 0.5 * float(active.weights @ np.linalg.slogdet(local)[1]) if local.shape[-1] else 0.0
     evidence -= 0.5 * float(np.linalg.slogdet(schur)[1]) if len(schur) else 0.0
     covariance = np.linalg.inv(schur) if len(schur) else schur
     evidence += sum(_mixed(problem, active, x, covariance, e) for e in active.effects if e.kind == "mean")

@@ -47,7 +47,9 @@ def lost(problem: Problem, fitted: Fit, projection: Projection) -> Float[np.ndar
 def _integrated(problem: Problem, active: Active, projection: Projection) -> tuple[np.ndarray, np.ndarray]:
     """Tangents times the covariance (cluster, row, k) of what is integrated out, and its directions (k, dimension)."""
     inner = are_states(problem, active)
+    own, along = projection.local_columns @ projection.local_inverse, own_basis(problem, active)
     if not inner.any():
-        return projection.local_columns @ projection.local_inverse, own_basis(problem, active)
-    columns = projection.columns[..., inner]
-    return columns @ projection.alone(inner), basis(problem, active)[: len(inner)][inner]
+        return own, along
+    states = projection.columns[..., inner] @ projection.alone(inner)
+    along_states = basis(problem, active)[: len(inner)][inner]
+    return np.concatenate([states, own], axis=-1), np.concatenate([along_states, along])

@@ -128,7 +128,9 @@ def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Arou
     for _ in range(_ROUNDS):
         volume = _expanded(problem, here, free)
         move = (fit(problem.with_volume(volume), here, free.effects).x - here)[free.index]
-        move *= min(1.0, reach / float(np.max(np.abs(move) / free.scale, initial=1e-300)))
+        move = np.clip(
+            move, -reach * free.scale, reach * free.scale
+        )  # one that runs away does not hold the others
         best, highest = here, height
         for share in _SHARES:
             trial = here.copy()
@@ -157,9 +159,7 @@ def _inner(
     bare = problem.with_volume(None)
     shared_states = states(bare)
     if shared_states.blocks:
-        x, curvature = states_mode(bare, shared_states, x, tolerance=tolerance)
-        volume = -0.5 * np.linalg.slogdet(curvature)[1]
-        return x, np.full(problem.n_cluster, volume / problem.n_cluster)
+        return states_mode(bare, shared_states, x, tolerance=tolerance)
     x, local = own_mode(bare, activate(bare), x, tolerance=tolerance, near=near)
     return x, -0.5 * np.linalg.slogdet(local)[1]
 

@@ -45,6 +45,14 @@ class System:
         """Whether a step can be told: far out a curvature may overflow where the log posterior does not."""
         return all((np.abs(part) < _ENDLESS).all() for part in vars(self).values())
 
+    def eliminated(self) -> tuple[np.ndarray, np.ndarray]:
+        """Curvature (cluster, local, local) of the local coordinates, and (global, global) of the others without them."""
+        local, schur = positive(self.local), self.curvature
+        if local.shape[-1]:
+            answer = np.linalg.solve(local, np.swapaxes(self.cross, 1, 2))
+            schur = schur - np.einsum("c,cij,cjk->ik", self.weights, self.cross, answer)
+        return local, positive(schur) if np.isfinite(schur).all() else schur
+
     @property
     def own(self) -> System:
         """The system of the local coordinates alone, the global ones held."""

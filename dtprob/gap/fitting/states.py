@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 
 from dtprob.gap.fitting.active import Active, activate
 from dtprob.gap.fitting.density import moved, system_at, value_of
-from dtprob.gap.fitting.newton import newton_step, positive
+from dtprob.gap.fitting.newton import newton_step
 from dtprob.gap.model.problem import Problem
 
 _MANY: Final = 0.25
@@ -27,21 +27,19 @@ _NORMAL: Final = ("Normal", "MultivariateNormal", "GaussianRandomWalk")
 
 
 def states(problem: Problem) -> Active:
-    """The states of the base model as the only free coordinates.
+    """The states of the base model, and beside them what clusters have of their own, as the only free coordinates.
 
-    These are what is drawn in units of an unknown spread, and where there is about one for every reading whatever is large.
-    Where clusters have unknowns of their own these are integrated out, and there are no states.
+    States are what is drawn in units of an unknown spread, and where there is about one for every reading all that is large.
     """
     active, sites = activate(problem), problem.declaration.sites
     shared = [b for b in active.blocks if not b.local]
-    if active.local_index.shape[1]:
-        return replace(active, blocks=())
     many = sum(b.size for b in shared) >= _MANY * problem.observed.count
     chosen = (
-        b.name in problem.decentred or (many and b.size >= _LARGE and sites[b.name].distribution in _NORMAL)
+        b.name in problem.in_units or (many and b.size >= _LARGE and sites[b.name].distribution in _NORMAL)
         for b in shared
     )
-    return replace(active, blocks=tuple(b for b, is_state in zip(shared, chosen, strict=True) if is_state))
+    found = tuple(b for b, is_state in zip(shared, chosen, strict=True) if is_state)
+    return replace(active, blocks=(*found, *(b for b in active.blocks if b.local)) if found else ())
 
 
 def are_states(problem: Problem, active: Active) -> Bool[np.ndarray, " shared"]:
@@ -56,12 +54,12 @@ def held(problem: Problem) -> Int[np.ndarray, " shared"]:
 
 def states_mode(
     problem: Problem, active: Active, x: np.ndarray, *, steps: int = 20, tolerance: float = 1e-3
-) -> tuple[Float[np.ndarray, " dimension"], Float[np.ndarray, "state state"]]:
-    """The point with states at their mode given all else, and their curvature there.
+) -> tuple[Float[np.ndarray, " dimension"], Float[np.ndarray, " cluster"]]:
+    """The point with states at their mode given all else, and V_c there; that of states in equal parts.
 
     Args:
         problem: the model on its data, nothing of it integrated out.
-        active: the states.
+        active: the states, and beside them what clusters have of their own.
         x: where to start.
         steps: at most so many Gauss-Newton steps.
         tolerance: stop when the gain that a step promises, in nats, falls below.
@@ -80,4 +78,6 @@ def states_mode(
             damping = max(4 * damping, 1e-3)
         if step.gain < tolerance:
             break
-    return x, positive(system.curvature)
+    local, schur = system.eliminated()
+    volume = np.full(problem.n_cluster, -0.5 * np.linalg.slogdet(schur)[1] / problem.n_cluster)
+    return x, volume - 0.5 * np.linalg.slogdet(local)[1] if local.shape[-1] else volume

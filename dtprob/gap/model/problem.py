@@ -24,6 +24,7 @@ from dtprob.gap.model.angles import unrolled
 from dtprob.gap.model.compiled import Compiled
 from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
+from dtprob.gap.model.in_units import in_units
 from dtprob.gap.model.layout import Block, Known, Layout, make_layout, normal_of
 from dtprob.gap.model.observed import Observed
 from dtprob.gap.model.own import Own
@@ -266,6 +267,11 @@ class Problem:
     def field_of(self, effect: Effect) -> Block:
         """The block of a live variance effect's field."""
         return self.layout[effect.site_name(FIELD)]
+
+    @cached_property
+    def in_units(self) -> frozenset[str]:
+        """Shared unknowns that are drawn in units of another one, by the model or since they are decentred."""
+        return self.decentred | in_units(self)
 
     @cached_property
     def float_sites(self) -> dict[str, jax.ShapeDtypeStruct]:

@@ -1,0 +1,123 @@
+"""Levels of clusters beside levels that clusters share: their spreads are those of the exact marginal mode."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+from scipy import optimize, stats
+
+from dtprob.gap.fitting.integrated import based
+from dtprob.gap.fitting.states import held, states
+from dtprob.gap.model.problem import Problem
+from dtprob.models.declaration import model
+
+DEVICES, DAYS = 24, 30
+AXES = {"mean": ("row",)}
+
+
+def read(mean, y):
+    noise = numpyro.sample("noise", dist.LogNormal(-1.0, 1.0))
+    with numpyro.plate("row", len(mean)):
+        numpyro.sample("y", dist.Normal(numpyro.deterministic("mean", mean), noise), obs=y)
+
+
+@model(axes=AXES, cluster="device")
+def in_units(device, day, y=None):
+    """Levels as they are mostly written: standard normal numbers times a spread."""
+    centre = numpyro.sample("centre", dist.Normal(0.0, 3.0))
+    between_devices = numpyro.sample("between_devices", dist.HalfNormal(1.0))
+    between_days = numpyro.sample("between_days", dist.HalfNormal(1.0))
+    with numpyro.plate("devices", DEVICES):
+        u = numpyro.sample("u", dist.Normal(0.0, 1.0))
+    with numpyro.plate("days", DAYS):
+        w = numpyro.sample("w", dist.Normal(0.0, 1.0))
+    read(centre + between_devices * u[device] + between_days * w[day], y)
+
+
+@model(axes=AXES, cluster="device")
+def centred(device, day, y=None):
+    """The same model, its levels drawn with the spread."""
+    centre = numpyro.sample("centre", dist.Normal(0.0, 3.0))
+    between_devices = numpyro.sample("between_devices", dist.HalfNormal(1.0))
+    between_days = numpyro.sample("between_days", dist.HalfNormal(1.0))
+    with numpyro.plate("devices", DEVICES):
+        u = numpyro.sample("u", dist.Normal(0.0, between_devices))
+    with numpyro.plate("days", DAYS):
+        w = numpyro.sample("w", dist.Normal(0.0, between_days))
+    read(centre + u[device] + w[day], y)
+
+
+@model(axes=AXES, cluster="device")
+def of_days_alone(device, day, y=None):
+    centre = numpyro.sample("centre", dist.Normal(0.0, 3.0))
+    between_days = numpyro.sample("between_days", dist.HalfNormal(1.0))
+    with numpyro.plate("days", DAYS):
+        w = numpyro.sample("w", dist.Normal(0.0, 1.0))
+    read(centre + between_days * w[day] + 0.0 * device, y)
+
+
+@model(axes=AXES, cluster="device")
+def regression(device, day, y=None):
+    """Several coefficients, none of them in units of another unknown."""
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0).expand([3]).to_event(1))
+    read(slope[0] + slope[1] * day / DAYS + slope[2] * device / DEVICES, y)
+
+
+@pytest.fixture(scope="module")
+def data():
+    rng = np.random.default_rng(0)
+    device, day = (index.ravel() for index in np.indices((DEVICES, DAYS)))
+    kept = rng.random(len(device)) < 0.4
+    device, day = device[kept], day[kept]
+    y = 1.0 + 0.3 * rng.normal(size=DEVICES)[device] + 0.1 * rng.normal(size=DAYS)[day]
+    return {"device": device, "day": day, "y": y + 0.4 * rng.normal(size=len(y))}
+
+
+def exact(data, *, devices):
+    """Mode of the marginal density of logarithms of spreads and the centre."""
+    groups = [(data["day"][:, None] == data["day"]), (data["device"][:, None] == data["device"])]
+
+    def loss(x):
+        noise, *spreads = np.exp(x[1:])
+        parts = sum(s**2 * group for s, group in zip(spreads, groups, strict=False))
+        covariance = noise**2 * np.eye(len(data["y"])) + parts
+        value = stats.multivariate_normal(np.full(len(data["y"]), x[0]), covariance).logpdf(data["y"])
+        value += stats.norm(0, 3).logpdf(x[0]) + stats.norm(-1, 1).logpdf(x[1])
+        return -(value + sum(stats.halfnorm(0, 1).logpdf(s) + np.log(s) for s in spreads))
+
+    start = np.array([1.0, -1.0, -2.0, *([-1.0] if devices else [])])
+    return np.exp(optimize.minimize(loss, start, method="BFGS").x[1:])
+
+
+@pytest.mark.parametrize("twin", [in_units, centred, of_days_alone])
+def test_spreads_are_those_of_the_marginal_mode(twin, data):
+    """At the joint mode the spread of days was five times too large, and hid what changed from day to day."""
+    found = based(
+        Problem(twin, {n: jnp.asarray(v) for n, v in data.items()}, [], "device"), jax.random.key(0)
+    )
+    names = ["noise", "between_days", *(["between_devices"] if twin is not of_days_alone else [])]
+    values = found.problem.compiled.sites(found.fitted.x)
+    told = [float(values[name]) for name in names]
+    assert found.fitted.converged
+    np.testing.assert_allclose(told, exact(data, devices=len(names) == 3), rtol=0.05)
+
+
+@pytest.mark.parametrize(
+    ("twin", "expected"),
+    [(in_units, {"w"}), (of_days_alone, {"w"}), (centred, {"w_decentered"}), (regression, set())],
+)
+def test_what_is_drawn_in_units_of_another(twin, expected, data):
+    problem = Problem(twin, {n: jnp.asarray(v) for n, v in data.items()}, [], "device")
+    assert problem.in_units == expected
+    assert len(states(problem).global_index) == (DAYS if expected else 0)
+    shared = {
+        "centre",
+        "noise",
+        "between_days",
+        "between_devices",
+        "slope",
+    } & problem.declaration.latent.keys()
+    size = {"slope": 3}
+    assert len(held(problem)) == sum(size.get(name, 1) for name in shared)
