@@ -128,9 +128,8 @@ def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Arou
     for _ in range(_ROUNDS):
         volume = _expanded(problem, here, free)
         move = (fit(problem.with_volume(volume), here, free.effects).x - here)[free.index]
-        move = np.clip(
-            move, -reach * free.scale, reach * free.scale
-        )  # one that runs away does not hold the others
+        # each by itself: one that runs away does not hold the others
+        move = np.clip(move, -reach * free.scale, reach * free.scale)
         best, highest = here, height
         for share in _SHARES:
             trial = here.copy()

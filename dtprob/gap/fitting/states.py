@@ -29,7 +29,7 @@ _NORMAL: Final = ("Normal", "MultivariateNormal", "GaussianRandomWalk")
 def states(problem: Problem) -> Active:
     """The states of the base model, and beside them what clusters have of their own, as the only free coordinates.
 
-    States are what is drawn in units of an unknown spread, and where there is about one for every reading all that is large.
+    States are what is drawn in units of an unknown spread, and all that is large where nearly every reading has one.
     """
     active, sites = activate(problem), problem.declaration.sites
     shared = [b for b in active.blocks if not b.local]
