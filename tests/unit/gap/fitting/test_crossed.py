@@ -8,7 +8,9 @@ import numpyro.distributions as dist
 import pytest
 from scipy import optimize, stats
 
+from dtprob.gap.fitting.fit import fit
 from dtprob.gap.fitting.integrated import based
+from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.states import held, states
 from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import model
@@ -121,3 +123,30 @@ def test_what_is_drawn_in_units_of_another(twin, expected, data):
     } & problem.declaration.latent.keys()
     size = {"slope": 3}
     assert len(held(problem)) == sum(size.get(name, 1) for name in shared)
+
+
+def test_readings_that_are_left_out_are_judged_by_all_that_is_not_known_of_states():
+    """A walk of 120 steps, of which every third reading is left out: its density is that of Kriging."""
+    rng = np.random.default_rng(2)
+    count = 120
+    y = np.cumsum(2.0 * rng.normal(size=count)) + rng.normal(size=count)
+    kept = (np.arange(count) % 3 > 0).astype(float)
+
+    def walk(y=None):
+        step = numpyro.sample("step", dist.LogNormal(jnp.log(2.0), 0.01))
+        shadowing = numpyro.sample("shadowing", dist.GaussianRandomWalk(step, num_steps=count))
+        with numpyro.plate("time", count):
+            numpyro.sample("y", dist.Normal(numpyro.deterministic("level", shadowing), 1.0), obs=y)
+
+    problem = Problem(walk, {"y": jnp.asarray(y)}, [])
+    found = fit(problem, problem.null(), weights=kept)
+    step = float(problem.compiled.sites(found.x)["step"])
+    at = np.arange(1, count + 1)
+    covariance = step**2 * np.minimum.outer(at, at)
+    seen, left = np.flatnonzero(kept), np.flatnonzero(kept == 0)
+    weights = np.linalg.solve(
+        covariance[np.ix_(seen, seen)] + np.eye(len(seen)), covariance[np.ix_(seen, left)]
+    )
+    spread = covariance[left, left] - (covariance[np.ix_(left, seen)] * weights.T).sum(1) + 1.0
+    expected = stats.norm(weights.T @ y[seen], np.sqrt(spread)).logpdf(y[left])
+    np.testing.assert_allclose(marginal(problem, found)[left], expected, rtol=1e-3, atol=1e-2)
