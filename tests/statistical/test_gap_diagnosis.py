@@ -18,12 +18,10 @@ from dtprob.gap import diagnose as diagnosing
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting import integrated
 from dtprob.gap.fitting.fit import fit
-from dtprob.gap.model.observed import Observed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.which.confirm import confirm
 from dtprob.inference import NUTS, Laplace
-from dtprob.models.arguments import split_static
 from dtprob.models.declaration import model
 from tests.unit.gap.examples import (
     SIGMA,
@@ -37,6 +35,7 @@ from tests.unit.gap.examples import (
     ripple,
     saturation,
     tone,
+    use,
 )
 
 EFFECTS = (bend(), ripple(), ripple("ripple5", 5.0), saturation(), jitter())
@@ -64,12 +63,7 @@ def shared_compilation():
     def shared(key, make, data):
         if key not in known:
             known[key] = make()
-        problem = known[key]
-        problem.data, problem.arrays = dict(data), split_static(data)[0]
-        problem.programs._arrays = problem.arrays
-        problem.compiled.arrays = problem.compiled.arrays._replace(data=problem.arrays)
-        problem.observed = Observed(problem._declared, problem.arrays)
-        return problem
+        return use(known[key], data)
 
     def key_of(model, data, effects, cluster, live=()):
         shapes = tuple((n, np.shape(v), str(np.asarray(v).dtype)) for n, v in data.items())

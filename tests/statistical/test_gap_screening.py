@@ -14,29 +14,17 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bootstrap import more, replicate
 from dtprob.gap.fitting.plausible import SCALES
 from dtprob.gap.fitting.projection import project
-from dtprob.gap.model.observed import Observed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise, gamma_tail
 from dtprob.gap.view import view
 from dtprob.gap.where.locate import locate
 from dtprob.gap.which.screen import screen
-from dtprob.models.arguments import split_static
 from dtprob.models.declaration import model
-from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation
+from tests.unit.gap.examples import SIGMA, bend, draw, inputs, jitter, line, pair, ripple, saturation, use
 
 EFFECTS = (bend(), ripple(), ripple("ripple5", 5.0), pair(), saturation(), jitter())
 FAST = Settings(replicates=200, site_replicates=99)
-
-
-def use(problem, data):
-    """Put other data of the same shapes into a compiled problem."""
-    problem.data = dict(data)
-    problem.arrays = split_static(data)[0]
-    problem.programs._arrays = problem.arrays
-    problem.compiled.arrays = problem.compiled.arrays._replace(data=problem.arrays)
-    problem.observed = Observed(problem._declared, problem.arrays)
-    return problem
 
 
 @pytest.fixture(scope="module")

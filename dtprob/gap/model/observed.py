@@ -54,7 +54,7 @@ class Observed:
             n: np.broadcast_to(np.asarray(found.get(n, 1.0)) > 0, site.shape) for n, site in sites.items()
         }
 
-    @property
+    @cached_property
     def count(self) -> int:
         """Entries that count, a complex one once."""
         return sum(int(entries.sum()) for entries in self.counted.values())

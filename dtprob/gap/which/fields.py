@@ -57,8 +57,9 @@ def tests_of_fields(
         placed: how the places of effects that may act anywhere were found, by name.
     """
     energy: dict[str, np.ndarray] = {}
+    values = around.grown() if fields else {}
     for part in drawn.parts() if fields else ():
-        found = problem.programs.field_energy(around.grown(), part, fields)
+        found = problem.programs.field_energy(values, part, fields)
         energy = {n: np.concatenate([energy[n], e[1:]]) if energy else e for n, e in found.items()}
     tested = field_tests(energy, [e.name for e in fields], drawn.at_sites)
     for k, found in ((k, placed[e.name]) for k, e in enumerate(fields) if e.name in placed):

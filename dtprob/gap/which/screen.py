@@ -127,9 +127,9 @@ def screen(
         null_p.min(axis=1, initial=1.0), *(found.replicate_p for found in placed.values())
     )
     tests = effective_tests(_smallest(replicate_p, tested.replicates.min(axis=1, initial=1.0)))
-    if _is_open(tested.smallest, mean_p, tests, settings) and drawn.most(settings.site_times) > 1:
-        further = more(drawn, drawn.most(settings.site_times))
-        tested = tests_of_fields(problem, around, fields, further, placed)
+    times = drawn.most(settings.site_times)
+    if times > 1 and _is_open(tested.smallest, mean_p, tests, settings):
+        tested = tests_of_fields(problem, around, fields, more(drawn, times), placed)
         tests = effective_tests(replicate_p) + effective_tests(tested.replicates.min(axis=1))
     smallest = np.concatenate([mean_p[0], tested.smallest])
     names = [e.name for e in (*means, *fields)]
@@ -159,8 +159,8 @@ def _smallest(replicate_p: np.ndarray, *others: np.ndarray) -> np.ndarray:
 
 def _is_open(fields: np.ndarray, means: np.ndarray, tests: float, settings: Settings) -> bool:
     """Whether fields alone show a gap, by p-values so large that a hundred replicates do not tell how rare they are."""
-    p = float(any_of(fields, tests).min(initial=1.0))
-    return _SURE < p <= settings.level / 2 and p < float(any_of(means, tests).min(initial=1.0))
+    least = fields.min(initial=1.0)
+    return _SURE < any_of(least, tests) <= settings.level / 2 and least < means.min(initial=1.0)
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,8 @@ import numpyro
 import numpyro.distributions as dist
 
 from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.model.observed import Observed
+from dtprob.models.arguments import split_static
 from dtprob.models.complex_normal import ComplexNormal
 
 SIGMA = 0.5
@@ -220,3 +222,12 @@ def gusty():
 def raised(x, at, size):
     """What a bump adds."""
     return size * np.exp(-0.5 * ((x - at) / WIDTH) ** 2)
+
+
+def use(problem, data):
+    """Put other data of the same shapes into a compiled problem."""
+    problem.data, problem.arrays = dict(data), split_static(data)[0]
+    problem.programs._arrays = problem.arrays
+    problem.compiled.arrays = problem.compiled.arrays._replace(data=problem.arrays)
+    problem.observed = Observed(problem._declared, problem.arrays)
+    return problem

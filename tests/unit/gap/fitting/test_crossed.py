@@ -19,6 +19,15 @@ DEVICES, DAYS = 24, 30
 AXES = {"mean": ("row",)}
 
 
+def unknown():
+    """The centre of all levels, the spread between devices, the spread between days."""
+    return (
+        numpyro.sample("centre", dist.Normal(0.0, 3.0)),
+        numpyro.sample("between_devices", dist.HalfNormal(1.0)),
+        numpyro.sample("between_days", dist.HalfNormal(1.0)),
+    )
+
+
 def read(mean, y):
     noise = numpyro.sample("noise", dist.LogNormal(-1.0, 1.0))
     with numpyro.plate("row", len(mean)):
@@ -28,9 +37,7 @@ def read(mean, y):
 @model(axes=AXES, cluster="device")
 def in_units(device, day, y=None):
     """Levels as they are mostly written: standard normal numbers times a spread."""
-    centre = numpyro.sample("centre", dist.Normal(0.0, 3.0))
-    between_devices = numpyro.sample("between_devices", dist.HalfNormal(1.0))
-    between_days = numpyro.sample("between_days", dist.HalfNormal(1.0))
+    centre, between_devices, between_days = unknown()
     with numpyro.plate("devices", DEVICES):
         u = numpyro.sample("u", dist.Normal(0.0, 1.0))
     with numpyro.plate("days", DAYS):
@@ -41,9 +48,7 @@ def in_units(device, day, y=None):
 @model(axes=AXES, cluster="device")
 def centred(device, day, y=None):
     """The same model, its levels drawn with the spread."""
-    centre = numpyro.sample("centre", dist.Normal(0.0, 3.0))
-    between_devices = numpyro.sample("between_devices", dist.HalfNormal(1.0))
-    between_days = numpyro.sample("between_days", dist.HalfNormal(1.0))
+    centre, between_devices, between_days = unknown()
     with numpyro.plate("devices", DEVICES):
         u = numpyro.sample("u", dist.Normal(0.0, between_devices))
     with numpyro.plate("days", DAYS):

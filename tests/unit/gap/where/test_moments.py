@@ -252,8 +252,8 @@ def test_delays_of_another_law_are_noticed_by_their_shape(law):
     true = WAITING[law][1]
     probability = (np.arange(1000) + 0.5) / 1000
     spread = np.log(true.ppf(probability)).std()
-    found = waited(law, np.exp(spread * np.random.default_rng(3).normal(size=(40, 25))))
-    assert {f.moment for f in found.sites if f.p_value < 0.01} & {"skewness", "tails"}
+    found = waited(law, np.exp(spread * np.random.default_rng(3).normal(size=(40, 50))))
+    assert {f.moment for f in found.sites if f.p_value < 0.0025} & {"skewness", "tails"}
 
 
 @pytest.mark.parametrize("law", list(WAITING))
