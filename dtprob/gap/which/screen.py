@@ -160,7 +160,8 @@ def _smallest(replicate_p: np.ndarray, *others: np.ndarray) -> np.ndarray:
 def _is_open(fields: np.ndarray, means: np.ndarray, tests: float, settings: Settings) -> bool:
     """Whether fields alone show a gap, by p-values so large that a hundred replicates do not tell how rare they are."""
     least = fields.min(initial=1.0)
-    return _SURE < any_of(least, tests) <= settings.level / 2 and least < means.min(initial=1.0)
+    is_open = _SURE < float(any_of(least, tests)) <= settings.level / 2
+    return is_open and bool(least < means.min(initial=1.0))
 
 
 @dataclass(frozen=True)
