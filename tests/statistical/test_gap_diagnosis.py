@@ -380,7 +380,7 @@ def town(east, north, power=None):
     ("wrong", "labels"),
     [
         (lambda distance, _power: 2.0 * np.sin(2 * np.pi * distance / 40), ("ripple in distance, 17 to 32",)),
-        (lambda _distance, power: np.minimum(-95.0 - power, 0.0), ("along ", "beyond a value of ")),
+        (lambda _distance, power: np.minimum(-95.0 - power, 0.0), ("along ", "beyond ")),
     ],
     ids=["a wave from the ground", "a receiver that saturates"],
 )

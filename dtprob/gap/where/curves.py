@@ -27,8 +27,8 @@ _CROSSED: Final = 3
 """Half waves along each of two columns of what varies over both."""
 _SHARES: Final = 16
 """Parts of a column between whose values steps are looked for."""
-_CENTRES: Final = 32
-_NEAREST: Final = (1 / 32, 1 / 16, 1 / 8)
+_CENTRES: Final = 64
+_NEAREST: Final = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Places in the plane of two columns about which a compact region is looked for, and shares of the positions in one."""
 _MOST_PAIRS: Final = 6
 _GROUPS: Final = 32
@@ -64,6 +64,7 @@ class Curves:
         ripple: of a band of ripples, what they are along.
         column: of groups of positions, the column of the data that makes them.
         overlaps: whether they tell the same many times over: their largest score says where, but their sum says nothing.
+        places: where each of them lies, in words, of those that lie somewhere.
     """
 
     label: str
@@ -71,6 +72,7 @@ class Curves:
     ripple: Ripple | None = None
     column: str | None = None
     overlaps: bool = False
+    places: tuple[str, ...] = ()
 
     @property
     def extent(self) -> tuple[int, int]:
@@ -132,24 +134,26 @@ def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
         first, second = (_waves(_rank(found[name]), 1, _CROSSED) for name in (one, other))
         products = first[:, None] * second[None]
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
-        near = _neighbourhoods(np.stack([found[one], found[other]], axis=1).astype(float))
-        yield Curves(f"near a place of {one} and {other}", near, overlaps=True)
+        yield _neighbourhoods((one, other), np.stack([found[one], found[other]], axis=1).astype(float))
     crossed = [(one, other) for one, other in itertools.product(smooth, made) if one != other]
     for one, other in crossed[:_MOST_PAIRS]:
         yield Curves(f"along {one} by {other}", grouped(made[other]).multiply(_line(found[one])).tocsr())
     yield from itertools.islice(_cells(made, size), _MOST_PAIRS)
 
 
-def _neighbourhoods(place: np.ndarray) -> sparse.csr_matrix:
-    """The positions nearest to each of a few places (size, 2) that cover them evenly, in small, larger and large groups."""
+def _neighbourhoods(over: tuple[str, str], place: np.ndarray) -> Curves:
+    """The positions nearest to each of a few places (size, 2) that cover them evenly, in groups of several sizes."""
     unit = (place - place.mean(axis=0)) / place.std(axis=0)
-    size, centres = len(unit), unit[covering(unit, _CENTRES)]
-    nearest = np.argsort(np.linalg.norm(unit - centres[:, None], axis=-1), axis=1)
+    size, centres = len(unit), covering(unit, _CENTRES)
+    nearest = np.argsort(np.linalg.norm(unit - unit[centres, None], axis=-1), axis=1)
     members = sorted({max(int(size * share), 2) for share in _NEAREST})
     groups = [row[:count] for count in members for row in nearest]
     weight = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
     shape = (len(groups), size)
-    return sparse.csr_matrix((np.ones(len(weight)), (weight, np.concatenate(groups))), shape)
+    values = sparse.csr_matrix((np.ones(len(weight)), (weight, np.concatenate(groups))), shape)
+    about = [" and ".join(f"{n} {at:.4g}" for n, at in zip(over, place[i], strict=True)) for i in centres]
+    places = tuple(f"the {count} of {size} nearest to {at}" for count in members for at in about)
+    return Curves(f"near a place of {over[0]} and {over[1]}", values, overlaps=True, places=places)
 
 
 def _cells(made: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
@@ -183,16 +187,18 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
     windows = [(low, low + n) for n in lengths for low in range(0, size - n + 1, n // 2)]
     weight = np.repeat(np.arange(len(windows)), [stop - low for low, stop in windows])
     position = np.concatenate([np.arange(*window) for window in windows])
-    shape = (len(windows), size)
-    return (
-        Curves(f"stretch of {over}", sparse.csr_matrix((np.ones(len(weight)), (weight, position)), shape)),
-    )
+    values = sparse.csr_matrix((np.ones(len(weight)), (weight, position)), (len(windows), size))
+    places = tuple(f"{over} {low} to {stop - 1}" for low, stop in windows)
+    return (Curves(f"stretch of {over}", values, places=places),)
 
 
 def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
-    """Smooth over a column (size,), beyond one of its values, and ripples over them."""
+    """Smooth over a column (size,), beyond values that part its ranks into equal shares, and ripples over them."""
     yield Curves(f"along {name}", _smooth(column))
-    yield Curves(f"beyond a value of {name}", _steps(column), overlaps=True)
+    cuts = np.unique(np.quantile(column, np.arange(1, _SHARES) / _SHARES))
+    steps = np.where(column > cuts[:, None], 0.5, -0.5)
+    places = tuple(f"beyond {cut:.4g} of {name}" for cut in cuts)
+    yield Curves(f"beyond a value of {name}", steps, overlaps=True, places=places)
     finest = min(
         finest, len(np.unique(column)) - 1
     )  # finer ones are the same again at the values that there are
@@ -231,12 +237,6 @@ def _smooth(column: np.ndarray) -> np.ndarray:
 def _line(column: np.ndarray) -> np.ndarray:
     """A line over a column's values (size,), of mean 0 and of half the mean square of a constant."""
     return (column - column.mean()) / (2**0.5 * column.std())
-
-
-def _steps(column: np.ndarray) -> np.ndarray:
-    """Steps at values that part the ranks into equal shares (step, size)."""
-    cuts = np.unique(np.quantile(column, np.arange(1, _SHARES) / _SHARES))
-    return np.where(column > cuts[:, None], 0.5, -0.5)
 
 
 def _rank(column: np.ndarray) -> np.ndarray:

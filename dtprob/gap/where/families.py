@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final, final
 
 import jax.numpy as jnp
@@ -242,14 +242,23 @@ def _stretches(site: Site) -> Iterator[Pattern]:
     if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_STRETCHES:
         return
     for found in stretches(shape[-1], site.axes[-1]):
-        each = sparse.kron(sparse.identity(shape[0]), found.values, "csr") if len(shape) > 1 else found.values
-        label = f"{found.label} x {site.axes[0]}" if len(shape) > 1 else found.label
-        yield Pattern(label, tuple(range(len(shape))), replace(found, label=label, values=each))
-        for first in stretches(shape[0], site.axes[0]) if len(shape) > 1 else ():
+        if len(shape) == 1:
+            yield Pattern(found.label, (0,), found)
+            continue
+        each = Curves(
+            f"{found.label} x {site.axes[0]}", sparse.kron(sparse.identity(shape[0]), found.values, "csr")
+        )
+        yield Pattern(each.label, (0, 1), each)
+        for first in stretches(shape[0], site.axes[0]):
             if first.extent[0] * found.extent[0] <= _MOST_BLOCKS:
-                blocks = sparse.kron(first.values, found.values, "csr")
-                label = f"block of {site.axes[0]} and {site.axes[1]}"
-                yield Pattern(label, (0, 1), replace(found, label=label, values=blocks, overlaps=True))
+                blocks = _crossed(f"block of {site.axes[0]} and {site.axes[1]}", first, found)
+                yield Pattern(blocks.label, (0, 1), blocks)
+
+
+def _crossed(label: str, first: Curves, second: Curves) -> Curves:
+    """Every stretch of a first axis with every one of a second."""
+    places = tuple(f"{one}, {other}" for one, other in itertools.product(first.places, second.places))
+    return Curves(label, sparse.kron(first.values, second.values, "csr"), overlaps=True, places=places)
 
 
 def _cycles(site: Site) -> Iterator[Pattern]:

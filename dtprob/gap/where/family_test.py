@@ -56,6 +56,15 @@ class FamilyTest(NamedTuple):
         """Which entries (entry,) the data depend on."""
         return self.variance > 1e-12 * max(float(self.variance.max(initial=0.0)), 1e-300)
 
+    @property
+    def label(self) -> str:
+        """The family in words; of curves that overlap, the place that tells most."""
+        curves = self.family.pattern.curves
+        if curves is None or not curves.overlaps or not self.seen.any():
+            return self.family.label
+        told = np.where(self.seen, self.first[0] ** 2 / np.where(self.seen, self.variance, 1.0), 0.0)
+        return f"{self.family.kind}, {curves.places[int(told.argmax()) // (len(told) // len(curves.places))]}"
+
 
 def family_test(family: Family, scores: np.ndarray, normal: np.ndarray | None = None) -> FamilyTest:
     """Test a family's squared scores (1 + replicate, entry), each entry scaled by its null variance.

@@ -263,4 +263,4 @@ def _finding(
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
     score = max(map(_each, tests))
-    return SiteFinding(site.name, best.family.label, p_value, net, spreads=spreads, score=score)
+    return SiteFinding(site.name, best.label, p_value, net, spreads=spreads, score=score)
