@@ -9,7 +9,7 @@ from typing import Final
 import numpy as np
 from jaxtyping import Float, Int
 
-from dtprob.gap.fitting.active import LOG_2PI, Active, activate, basis
+from dtprob.gap.fitting.active import LOG_2PI, Active, activate, basis, own_basis
 from dtprob.gap.fitting.density import cluster_terms, curved, moved, rescored, system_at, terms_of
 from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.newton import System, local_step, positive
@@ -54,29 +54,51 @@ def marginal(problem: Problem, fitted: Fit, *, steps: int = 30) -> np.ndarray:
     """Log marginal likelihood of each cluster (cluster,) given the fit's global coordinates.
 
     Local coordinates are looked for over their whole range, refitted per cluster and integrated out by Laplace's method, so
-    that clusters that the fit has not seen are judged fairly. Where there are none, states that clusters share are
-    integrated out to first order, as far as the fit knows them.
+    that clusters that the fit has not seen are judged fairly. States that clusters share are integrated out to first order,
+    as far as the fit knows them.
     """
     active = activate(problem, fitted.effects, spread=fitted.spread)
     if not active.local_index.shape[1]:
-        return terms_of(problem, active, fitted.x)[1:] + _widened(problem, active, fitted)
+        return terms_of(problem, active, fitted.x)[1:] + _widened(problem, active, fitted, fitted.x, None)
     x = swept(problem, fitted.x, partial(cluster_terms, problem, active))
     x, local = own_mode(problem, active, x, steps=steps)
     terms = cluster_terms(problem, active, x)
-    return terms + 0.5 * local.shape[-1] * LOG_2PI - 0.5 * np.linalg.slogdet(local)[1]
+    volume = 0.5 * local.shape[-1] * LOG_2PI - 0.5 * np.linalg.slogdet(local)[1]
+    return terms + volume + _widened(problem, active, fitted, x, local)
 
 
-def _widened(problem: Problem, active: Active, fitted: Fit) -> Float[np.ndarray, " cluster"]:
-    """What it adds to clusters' log likelihoods that states are only known with the covariance of the fit."""
+def _widened(
+    problem: Problem,
+    active: Active,
+    fitted: Fit,
+    x: Float[np.ndarray, " dimension"],
+    local: Float[np.ndarray, "cluster own own"] | None,
+) -> Float[np.ndarray, " cluster"]:
+    """What it adds to clusters' log likelihoods that states are only known with the covariance of the fit.
+
+    With residuals e at the mode of the own coordinates, tangents A of these and W of the states, P the states' covariance,
+    K = W P W' and M = 1 - A H^-1 A', by the lemmas of Woodbury and Sylvester: (e' (1 + K M)^-1 K e - log |1 + K M|) / 2.
+
+    Args:
+        problem: the model on its data.
+        active: the free coordinates.
+        fitted: the fit.
+        x: the point.
+        local: curvature H of own coordinates, their prior's included; None where there are none.
+    """
     inner = are_states(problem, active)
     if not inner.any():
         return np.zeros(problem.n_cluster)
-    along = basis(problem, active)[: len(inner)][inner]
-    e, w = (np.asarray(part) for part in problem.compiled.linearised(fitted.x, along))
-    spread = w @ fitted.covariance[np.ix_(inner, inner)] @ np.swapaxes(w, 1, 2)
-    wide = np.eye(e.shape[1]) + spread
-    inside = (e * np.linalg.solve(wide, e[..., None])[..., 0]).sum(1)
-    return 0.5 * ((e**2).sum(1) - inside - np.linalg.slogdet(wide)[1])
+    along = np.concatenate([basis(problem, active)[: len(inner)][inner], own_basis(problem, active)])
+    e, w = (np.asarray(part) for part in problem.compiled.linearised(x, along))
+    states, own = np.split(w, [inner.sum()], axis=-1)
+    known = states @ fitted.covariance[np.ix_(inner, inner)] @ np.swapaxes(states, 1, 2)
+    told = np.eye(e.shape[1])
+    if local is not None:
+        told = told - own @ np.linalg.solve(local, np.swapaxes(own, 1, 2))
+    wide = np.eye(e.shape[1]) + known @ told
+    inside = (e * np.linalg.solve(wide, known @ e[..., None])[..., 0]).sum(1)
+    return 0.5 * (inside - np.linalg.slogdet(wide)[1])
 
 
 def own_mode(

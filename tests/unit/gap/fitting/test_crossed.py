@@ -155,3 +155,42 @@ def test_readings_that_are_left_out_are_judged_by_all_that_is_not_known_of_state
     spread = covariance[left, left] - (covariance[np.ix_(left, seen)] * weights.T).sum(1) + 1.0
     expected = stats.norm(weights.T @ y[seen], np.sqrt(spread)).logpdf(y[left])
     np.testing.assert_allclose(marginal(problem, found)[left], expected, rtol=1e-3, atol=1e-2)
+
+
+def test_devices_that_are_left_out_are_judged_by_what_is_not_known_of_days():
+    """Every third device is left out: the density of its readings given all others is that of a normal vector."""
+    rng = np.random.default_rng(4)
+    devices, days = 12, 16
+    device, day = (
+        index.reshape(-1) for index in np.meshgrid(np.arange(devices), np.arange(days), indexing="ij")
+    )
+    seldom = rng.random(len(device)) < 0.4
+    device, day = device[seldom], day[seldom]
+    y = 1.5 * rng.normal(size=devices)[device] + 2.0 * rng.normal(size=days)[day] + rng.normal(size=len(day))
+
+    def crossed(device, day, y=None):
+        step = numpyro.sample("step", dist.LogNormal(jnp.log(2.0), 0.01))
+        with numpyro.plate("devices", devices):
+            own = numpyro.sample("own", dist.Normal(0.0, 1.5))
+        with numpyro.plate("days", days):
+            level = numpyro.sample("level", dist.Normal(0.0, step))
+        read_exactly(own[device] + level[day], y)
+
+    def read_exactly(mean, y):
+        with numpyro.plate("row", len(mean)):
+            numpyro.sample("y", dist.Normal(numpyro.deterministic("mean", mean), 1.0), obs=y)
+
+    data = {"device": jnp.asarray(device), "day": jnp.asarray(day), "y": jnp.asarray(y)}
+    problem = Problem(model(axes=AXES, cluster="device")(crossed), data, [], "device")
+    kept = (np.arange(devices) % 3 > 0).astype(float)
+    found = fit(problem, problem.null(), weights=kept)
+    step = float(problem.compiled.sites(found.x)["step"])
+    same = (np.equal.outer(device, device), np.equal.outer(day, day))
+    covariance = 1.5**2 * same[0] + step**2 * same[1] + np.eye(len(y))
+    seen = kept[device] > 0
+    for left in np.flatnonzero(kept == 0):
+        own = device == left
+        gain = np.linalg.solve(covariance[np.ix_(seen, seen)], covariance[np.ix_(seen, own)]).T
+        spread = covariance[np.ix_(own, own)] - gain @ covariance[np.ix_(seen, own)]
+        expected = stats.multivariate_normal(gain @ y[seen], spread).logpdf(y[own])
+        assert abs(marginal(problem, found)[left] - expected) < 0.02, left
