@@ -200,6 +200,7 @@ def _screening(evidence: Evidence) -> list[dict[str, Any]]:
             "p_value": first.p_value[i],
             "adjusted_p_value": first.adjusted[i],
             "absorbed_by": None if first.names[i] in refitted else first.absorbed_by[i],
+            "opposite": first.opposite[i],
         }
         for i in map(int, order)
     ]

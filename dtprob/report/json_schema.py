@@ -184,7 +184,10 @@ class Detectable(TypedDict):
 
 
 class Candidate(TypedDict):
-    """One line of the screening; an effect that a fitted parameter absorbs, or that nothing shows, has no statistic."""
+    """One line of the screening; an effect that a fitted parameter absorbs, or that nothing shows, has no statistic.
+
+    Of an `opposite` one the data ask for the side of its size that its prior excludes.
+    """
 
     effect: str
     sites: list[str]
@@ -192,6 +195,7 @@ class Candidate(TypedDict):
     p_value: Probability | None
     adjusted_p_value: Probability | None
     absorbed_by: NotRequired[str | None]
+    opposite: NotRequired[bool]
     kind: NotRequired[str]
 
 

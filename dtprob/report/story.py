@@ -29,6 +29,8 @@ from dtprob.report.units import DASH, percent
 
 _MUCH = 1.5
 """Times as much that everything again costs from which that is told."""
+_NAMING = ("LISTED", "LISTED_WITH_REMAINDER")
+"""Verdicts that name a cause."""
 
 
 @dataclass(frozen=True)
@@ -200,7 +202,7 @@ def _listed(report: Report) -> Story:
         "Cause found",
         "found",
         f"The gap comes from {_named(cause)}.",
-        f"{_closing(cause)} {rest}{_matters(report)}{_looks_alike(cause)}",
+        f"{_closing(cause)} {rest}{_matters(report)}{_looks_alike(cause)}{_opposite(report)}",
         _change(cause),
     )
 
@@ -220,7 +222,7 @@ def _remainder(report: Report) -> Story:
         "Cause found, but something is left",
         "partly",
         f"Part of the gap comes from {_named(cause)}. No known effect explains the rest.",
-        f"{_closing(cause)} What is left is real{_seat(report)}.{_matters(report)}{_looks_alike(cause)}",
+        f"{_closing(cause)} What is left is real{_seat(report)}.{_matters(report)}{_looks_alike(cause)}{_opposite(report)}",
         f"{_change(cause)} The twin will be closer but not right.",
     )
 
@@ -242,7 +244,21 @@ def _unlisted(report: Report) -> Story:
         "unknown",
         "There is a gap, and none of the known effects explains it.",
         f"{real}, but no effect on the list accounts for it: something remains with the best of them, too.",
-        f"Do not add a listed effect: it would hide the problem, not solve it. {look}",
+        f"Do not add a listed effect: it would hide the problem, not solve it. {look}{_opposite(report)}",
+    )
+
+
+def _opposite(report: Report) -> str:
+    """Which effects the data ask for with the sign that their priors exclude; beside a cause those asked for more."""
+    rows = [row for row in report.get("screening", []) if row["z"] is not None]
+    named = set(report["causes"][0]["effects"]) if report["verdict"] in _NAMING else set[str]()
+    least = max((row["z"] or 0.0 for row in rows if row["effect"] in named), default=0.0)
+    asked = [words(row["effect"]) for row in rows if row.get("opposite") and -(row["z"] or 0.0) > least]
+    if not asked:
+        return ""
+    more, its = " even more" * bool(named), "its size is" if len(asked) == 1 else "their sizes are"
+    return (
+        f" The data ask{more} for the opposite of {listing(asked[:3])}: look whether {its} of the right sign."
     )
 
 

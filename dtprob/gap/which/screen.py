@@ -59,6 +59,7 @@ class Screening:
         log_bayes_factor: of adding the candidate, from (u, J) and its prior.
         step: one-step estimate of each mean effect's parameters, flat.
         absorbed_by: the nuisance that hides the candidate, if one does.
+        opposite: whether the data surely ask for a size on the side that the prior of the candidate's only one excludes.
         detectable: from which size on each would be noticed nine times in ten; None of random fields and where none is.
         correlation: of the candidates' scores after adjustment; aliases are near +-1.
         locates: whether a candidate says how the expected observations move, not only how they spread.
@@ -72,6 +73,7 @@ class Screening:
     log_bayes_factor: np.ndarray
     step: dict[str, np.ndarray]
     absorbed_by: tuple[str | None, ...]
+    opposite: tuple[bool, ...]
     detectable: tuple[Detectable | None, ...]
     correlation: np.ndarray
     locates: tuple[bool, ...]
@@ -134,6 +136,9 @@ def screen(
     smallest = np.concatenate([mean_p[0], tested.smallest])
     names = [e.name for e in (*means, *fields)]
     order = np.array([names.index(c.name) for c in candidates], int)
+    sided = [k for k, e in enumerate(means) if _is_half(e) and e.name not in placed]
+    below = any_of(stats.norm.cdf(mean_z[0, sided]), tests) <= settings.level / 2
+    opposite = {means[k].name for k, is_below in zip(sided, below, strict=True) if is_below}
     log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
     return Screening(
         names=tuple(c.name for c in candidates),
@@ -143,6 +148,7 @@ def screen(
         log_bayes_factor=log_bf[order],
         step={e.name: scores.step(k) for k, e in enumerate(means)},
         absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),
+        opposite=tuple(c.name in opposite for c in candidates),
         detectable=tuple(_detectable(scores, c, settings) for c in candidates),
         correlation=_correlation(candidates, scores),
         locates=tuple(c.name in scores.locating for c in candidates),
@@ -155,6 +161,11 @@ def _smallest(replicate_p: np.ndarray, *others: np.ndarray) -> np.ndarray:
     for other in others:
         replicate_p = np.minimum(replicate_p[: len(other)], other[: len(replicate_p)])
     return replicate_p
+
+
+def _is_half(effect: Effect) -> bool:
+    """Whether an effect has one size, of which its prior excludes one side."""
+    return len(sizes(effect)) == 1 and is_one_sided(effect)
 
 
 def _is_open(fields: np.ndarray, means: np.ndarray, tests: float, settings: Settings) -> bool:

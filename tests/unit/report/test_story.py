@@ -202,6 +202,19 @@ def _report(**terms: list[float]) -> names.Any:
     }
 
 
+def test_effects_whose_opposite_the_data_ask_for_are_named() -> None:
+    """Beside a cause only where they are asked for more: what looks like the cause is asked for, too."""
+    report = _report()
+    below = {**report["screening"][1], "effect": "dry_step", "opposite": True}
+    for z, said in ((-5.9, True), (-0.5, False)):
+        rows = [report["screening"][0], {**below, "z": z}]
+        assert (
+            "even more for the opposite of dry step:" in tell({**report, "screening": rows}).meaning
+        ) == said
+        other = {**report, "verdict": "UNLISTED", "causes": [], "screening": rows}
+        assert "ask for the opposite of dry step: look whether its size" in tell(other).action
+
+
 def test_what_cannot_be_judged_is_said_with_its_reason() -> None:
     report = {**_report(), "verdict": "NO_GAP"}
     idle = {**report["screening"][2], "effect": "d", "absorbed_by": UNSEEN}

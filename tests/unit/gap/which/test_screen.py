@@ -51,6 +51,15 @@ def test_what_the_data_show_is_not_absorbed(size, hidden_by):
     assert seen.screening.absorbed_by == (hidden_by,)
 
 
+@pytest.mark.parametrize(("size", "opposite"), [(3.5, False), (0.0, False), (-3.5, True)])
+def test_what_the_data_ask_for_on_the_side_that_a_prior_excludes(size, opposite):
+    problem = Problem(slope, data_with(size), [nearly_the_slope(dist.HalfNormal(2.0))])
+    base = fitting.fit(problem, problem.null())
+    seen = view(problem, base, jax.random.key(0), Settings(replicates=100, site_replicates=19), located=False)
+    assert seen.screening.opposite == (opposite,)
+    assert (seen.screening.z[0] < 0) == (size < 0) or size == 0
+
+
 @pytest.mark.parametrize("prior", [dist.LogNormal(np.log(3.0), 0.2), dist.Gamma(9.0, 4.0)])
 def test_a_refit_finds_the_mode_under_any_prior(prior):
     data, effect = data_with(3.5), nearly_the_slope(prior)
