@@ -15,7 +15,7 @@ from dtprob.gap.compose import compose
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.integrated import based
-from dtprob.gap.fitting.soundness import check_noise, idle, notes
+from dtprob.gap.fitting.soundness import check_noise, idle, lopsided, notes
 from dtprob.gap.fitting.states import held
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
@@ -105,18 +105,21 @@ def diagnose(
 
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
     keys = jax.random.split(key, 3)
+    noted = lopsided(problem)
+    for note in noted:
+        say(f"note: {note}")
     say(f"fitting the base model to {problem.n_cluster} clusters")
     with differentiated_forwards():
         start = based(problem, keys[0], polished=settings.polished, say=say)
     problem, base = start.problem, start.fitted
     check_noise(problem, base)
     check_tolerance(problem, problem.compiled.misses(base.x), settings.tolerance_db)
-    noted = notes(problem, base)
-    for note in noted:
+    of_fit = notes(problem, base)
+    for note in of_fit:
         say(f"note: {note}")
     searched = search(problem, base, keys[1], settings, say)
     steps = searched.steps
-    noted = (*noted, *idle(steps[0].view.screening.absorbed_by))
+    noted = (*noted, *of_fit, *idle(steps[0].view.screening.absorbed_by))
     problem, base, last = steps[0].view.problem, steps[0].view.fitted, steps[-1].view
     say("judging on held-out clusters")
     assignment = closed.folds(problem.n_cluster, settings.folds)

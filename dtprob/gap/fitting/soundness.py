@@ -26,6 +26,9 @@ _SINGULAR: Final = 1e-8
 """Information along a direction, as a share of that of its parameters alone, below which data do not determine it."""
 _TAKES_PART: Final = 0.2
 """Weight of a parameter in a direction from which on it is named."""
+_LOPSIDED: Final = 16
+_MANY: Final = 50_000
+"""Times the data's rows, and rows, from which it is said what it costs that clusters are as long as the longest."""
 _SHOWN: Final = 4
 _STEP: Final = 0.01
 """Of a coordinate, to see what it acts on."""
@@ -104,6 +107,23 @@ def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
         )
     found += [f"{name} is at the end of its prior" for name in at_end(problem, fitted)]
     return (*found, *_too_large(problem, fitted), *_misfit(problem, fitted), *_undetermined(problem, fitted))
+
+
+def lopsided(problem: Problem) -> list[str]:
+    """A note where one cluster is so long that holding all as long as it costs much; nothing where none is."""
+    rows = problem.rows
+    times = rows.gather.size / len(rows.ids)
+    if times < _LOPSIDED or rows.gather.size < _MANY:
+        return []
+    values = np.bincount(rows.ids[rows.located == 1], minlength=problem.n_cluster)
+    longest = (
+        f"the longest of {problem.n_cluster} clusters by {problem.cluster_name!r} has {values.max()} values"
+    )
+    others = f"half of them have at most {np.median(values):.0f}"
+    costs = f"each costs the time and memory of the longest, {times:.0f} times those of the data"
+    return [
+        f"{longest}, {others}: {costs}; if its parts are independent of one another, let each be a cluster"
+    ]
 
 
 def idle(absorbed_by: Sequence[str | None]) -> list[str]:

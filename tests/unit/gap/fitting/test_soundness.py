@@ -13,7 +13,7 @@ from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting.at_end import at_end, shared_draws
 from dtprob.gap.fitting.base import fit_base
-from dtprob.gap.fitting.soundness import UNSEEN, check_noise, idle, notes
+from dtprob.gap.fitting.soundness import UNSEEN, check_noise, idle, lopsided, notes
 from dtprob.gap.model.problem import Problem
 from dtprob.inference import Laplace
 from tests.unit.gap.examples import bend, draw, inputs, line
@@ -255,3 +255,20 @@ def test_a_parameter_that_the_data_push_to_the_end_of_its_prior_is_said_and_stay
     below = np.cumsum(np.exp(log_density - log_density.max())[::-1])
     expected = grid[::-1][np.searchsorted(below / below[-1], [0.05, 0.5])]
     np.testing.assert_allclose(0.5 - np.quantile(drawn, [0.05, 0.5]), 0.5 - expected, rtol=0.25)
+
+
+def by_run(run, y=None):
+    mean = numpyro.deterministic("mean", numpyro.sample("a", dist.Normal(0.0, 1.0)) + 0.0 * run)
+    with numpyro.plate("row", len(run)):
+        numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+@pytest.mark.parametrize(("longest", "said"), [(2000, True), (40, False)])
+def test_what_one_long_cluster_costs_is_said(longest, said):
+    run = np.repeat(np.arange(41), [longest] + [5] * 40)
+    found = lopsided(Problem(by_run, {"run": jnp.asarray(run), "y": jnp.zeros(len(run))}, [], "run"))
+    assert bool(found) == said
+    assert (
+        not said
+        or "the longest of 41 clusters by 'run' has 2000 values, half of them have at most 5" in found[0]
+    )
