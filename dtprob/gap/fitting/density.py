@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from dtprob.gap.fitting.active import LOG_2PI, Active, basis, effect_prior
 from dtprob.gap.fitting.newton import NewtonStep, System
 from dtprob.gap.model.problem import Problem
+
+_FARTHEST: Final = 10.0
+"""Standard deviations of its prior that an unknown of the base model moves in a step at most."""
 
 
 def system_at(problem: Problem, active: Active, x: np.ndarray) -> System:
@@ -162,10 +167,23 @@ def volume_of(problem: Problem, active: Active, x: np.ndarray) -> float:
     return 0.0 if problem.volume is None else float(active.weights @ problem.volume.at(x))
 
 
-def moved(active: Active, x: np.ndarray, step: NewtonStep) -> np.ndarray:
-    """The point x after a step."""
+def moved(problem: Problem, active: Active, x: np.ndarray, step: NewtonStep) -> np.ndarray:
+    """The point x after a step, in which no cluster's own coordinate goes farther than it may."""
     x = x.copy()
     x[active.global_index] += step.shared
     if step.local.size:
-        x[active.local_index] += step.local
+        longest = farthest(problem)[active.local_index]
+        x[active.local_index] += np.clip(step.local, -longest, longest)
     return x
+
+
+def farthest(problem: Problem) -> Float[np.ndarray, " dimension"]:
+    """How far each coordinate may move in a step: the base model's unknowns no farther than any prior expects.
+
+    Where a likelihood is flat, as of a logarithm at minus infinity, or at the end of a uniform prior, nothing leads back.
+    """
+    deviation = problem.prior_middle[1]  # of the base model's unknowns, which are the first ones
+    longest = np.full(problem.dimension, np.inf)
+    count = sum(block.index.size for block in problem.blocks_of(None))
+    longest[:count] = np.where(deviation[:count] > 0, _FARTHEST * deviation[:count], np.inf)
+    return longest

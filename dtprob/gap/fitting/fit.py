@@ -16,7 +16,16 @@ import numpy as np
 
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.active import LOG_2PI, Active, activate
-from dtprob.gap.fitting.density import cluster_terms, curved, moved, rescored, system_at, value_of, volume_of
+from dtprob.gap.fitting.density import (
+    cluster_terms,
+    curved,
+    farthest,
+    moved,
+    rescored,
+    system_at,
+    value_of,
+    volume_of,
+)
 from dtprob.gap.fitting.newton import NewtonStep, System, newton_step
 from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
@@ -30,8 +39,6 @@ _PATIENCE: Final = 8
 """Gauss-Newton steps with new curvatures that may not have arrived."""
 _FIRST_DAMPING: Final = 1e-3
 _LEAST_DAMPING: Final = 1e-12
-_FARTHEST: Final = 10.0
-"""Standard deviations of its prior that an unknown of the base model moves in a step at most."""
 _AS_PROMISED: Final = (0.6, 1.4)
 """Share of a promised gain that shows that curvatures still hold, so that a gradient is all that the next step needs."""
 _ALIKE: Final = 0.5
@@ -176,12 +183,12 @@ def _better(
     tolerance: float,
 ) -> _Trial:
     """The first of ever more damped steps that raises the log posterior, or the last that did not."""
-    lowest, farthest = _lowest(problem, active, x), _farthest(problem, active)
+    lowest, longest = _lowest(problem, active, x), farthest(problem)[active.global_index]
     trial = _Trial(x, value, 0.0, damping)
     for _ in range(_TRIES):
         step = newton_step(system, damping, lowest)
-        share = min(1.0, 1.0 / float(np.max(np.abs(step.shared) / farthest, initial=1e-300)))
-        shifted = moved(active, x, NewtonStep(share * step.shared, share * step.local, step.gain))
+        share = min(1.0, 1.0 / float(np.max(np.abs(step.shared) / longest, initial=1e-300)))
+        shifted = moved(problem, active, x, NewtonStep(share * step.shared, share * step.local, step.gain))
         trial = _Trial(shifted, value_of(problem, active, shifted), step.gain, damping)
         if trial.value > value:
             break
@@ -200,18 +207,6 @@ def _lowest(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
             index = problem.layout.of(effect)
             lowest[index] = np.where(sides(effect), nulls(effect) - x[index], -np.inf)
     return lowest[active.global_index]
-
-
-def _farthest(problem: Problem, active: Active) -> np.ndarray:
-    """How far each global coordinate may move in a step: the base model's unknowns no farther than any prior expects.
-
-    Where a likelihood is flat, as of a logarithm at minus infinity, nothing leads back.
-    """
-    deviation = problem.prior_middle[1]  # of the base model's unknowns, which are the first ones
-    farthest = np.full(problem.dimension, np.inf)
-    count = sum(block.index.size for block in problem.blocks_of(None))
-    farthest[:count] = np.where(deviation[:count] > 0, _FARTHEST * deviation[:count], np.inf)
-    return farthest[active.global_index]
 
 
 def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, converged: bool) -> Fit:

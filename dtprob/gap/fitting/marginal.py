@@ -126,7 +126,7 @@ def own_mode(
     system = system_at(problem, own, x) if near is None else rescored(problem, own, x, near)
     for number in range(steps):
         step = local_step(system, damping)
-        trial = moved(own, x, step)
+        trial = moved(problem, own, x, step)
         new = cluster_terms(problem, active, trial)
         better = new > terms
         x[active.local_index[better]] = trial[active.local_index[better]]

@@ -69,7 +69,7 @@ def states_mode(
     system = system_at(problem, active, x)
     for _ in range(steps):
         step = newton_step(system, damping, lowest)
-        trial = moved(active, x, step)
+        trial = moved(problem, active, x, step)
         new = value_of(problem, active, trial)
         if new > value:
             x, value, damping = trial, new, damping / 8

@@ -172,3 +172,36 @@ def test_a_step_does_not_lead_where_a_logarithm_is_endless(seed):
     found = base.fit_base(problem, jax.random.key(seed))
     assert found.log_posterior == pytest.approx(-known.fun, abs=0.1)
     assert found.converged
+
+
+ANCHORS = jnp.array([[0.0, 0.0], [20.0, 0.0], [20.0, 12.0], [0.0, 12.0], [10.0, 6.0], [3.0, 6.0]])
+EPOCHS = 40
+
+
+@model(axes={"range": ("row",)}, cluster="epoch")
+def ranging(epoch, anchor, measured=None):
+    """A tag somewhere in a room, from ranges to six anchors at another height."""
+    spread = numpyro.sample("spread", dist.HalfNormal(0.3))
+    with numpyro.plate("epochs", EPOCHS):
+        place = [numpyro.sample(name, dist.Uniform(0.0, side)) for name, side in (("x", 20.0), ("y", 12.0))]
+    flat = [(p[epoch] - a[anchor]) ** 2 for p, a in zip(place, ANCHORS.T, strict=True)]
+    expected = numpyro.deterministic("range", jnp.sqrt(sum(flat) + 4.0))
+    with numpyro.plate("row", len(anchor)):
+        numpyro.sample("measured", dist.Normal(expected, spread), obs=measured)
+
+
+def test_places_at_the_wall_of_a_room_are_found():
+    """Their coordinates ran away to where a uniform prior has no curvature, and nothing led back."""
+    rng = np.random.default_rng(0)
+    epoch, anchor = (i.reshape(-1) for i in np.meshgrid(np.arange(EPOCHS), np.arange(6), indexing="ij"))
+    place = rng.uniform(0, [20.0, 12.0], (EPOCHS, 2))
+    place[:6, 1] = 0.02
+    flat = ((place[epoch] - np.asarray(ANCHORS)[anchor]) ** 2).sum(1)
+    measured = np.sqrt(flat + 4.0) + 0.1 * rng.normal(size=len(epoch))
+    data = {"epoch": jnp.asarray(epoch), "anchor": jnp.asarray(anchor), "measured": jnp.asarray(measured)}
+    problem = Problem(ranging, data, [], "epoch")
+    found = base.fit_base(problem, jax.random.key(0))
+    sites = problem.compiled.sites(found.x)
+    assert found.converged
+    assert float(sites["spread"]) == pytest.approx(0.1 * (1 - 2 / 6) ** 0.5, rel=0.15)
+    np.testing.assert_allclose(np.stack([sites["x"], sites["y"]], axis=1), place, atol=0.4)
