@@ -11,6 +11,7 @@ from dtprob.effects.rewriting import effects_of
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import means_among
 from dtprob.gap.fitting.marginal import settled
+from dtprob.gap.fitting.mirrored import mirrored
 from dtprob.gap.fitting.soundness import broken
 from dtprob.gap.fitting.sweep import turned
 from dtprob.gap.model.problem import Problem
@@ -40,7 +41,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     Args:
         problem: the model on its data.
         key: for prior draws.
-        starts: the centre of the prior and at most this many less one draws from it; fewer where the best agree.
+        starts: the centre of the prior and at most this many less one draws from it; fewer where all lead to one mode.
         polished: how many of the fits, the best of each optimum, are freed from local optima; fewer where two of
             them end at one height.
 
@@ -56,8 +57,10 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         fitted = fitting.fit(problem, turned(problem, x, problem.compiled.by_cluster))
         if np.isfinite(fitted.log_posterior):
             fits.append(fitted)
-        values = sorted((f.log_posterior for f in fits), reverse=True)
-        if len(values) > _ENOUGH and values[0] - values[_ENOUGH - 1] < _SAME:
+        values = sorted(
+            (f.log_posterior for f in fits), reverse=True
+        )  # three may agree on a lower one of two modes
+        if len(values) > _ENOUGH and values[0] - values[-1] < _SAME:
             break
     if not fits:
         raise broken(problem, [np.median(draws, axis=0), *draws[: starts - 1]])
@@ -97,7 +100,7 @@ def polish(
     along: Collection[str] | None = None,
     freed: Sequence[fitting.Fit] = (),
 ) -> fitting.Fit:
-    """Leave local optima: refit from the other peaks along each global nuisance until none leads elsewhere.
+    """Leave local optima: refit from the other peaks along each global nuisance, and mirrored, until none leads elsewhere.
 
     Args:
         problem: the model on its data.
@@ -111,6 +114,7 @@ def polish(
         if any(_is_same(fitted, one) for one in freed):
             return fitted
         peaks = _other_peaks(problem, fitted.x, scale, along)
+        peaks += mirrored(problem, fitted.x) if along is None else []
         short = [fitting.fit(problem, x, means, steps=_SHORT) for x in peaks]
         short.sort(key=lambda f: -f.log_posterior)
         long = [fitting.fit(problem, f.x, fitted.effects, spread=fitted.spread) for f in short[:_LONG]]
