@@ -334,7 +334,7 @@ def _replicate(
     def one(key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         split = zip(observations.items(), jax.random.split(key, len(observations)), strict=True)
         values = {name: whiten.sample(o, k) for (name, o), k in split}
-        return stacked({n: whiten.residual(o, values[n]) for n, o in observations.items()}, gather), values
+        return stacked([whiten.residual(o, values[n]) for n, o in observations.items()], gather), values
 
     return jax.lax.map(one, keys)
 

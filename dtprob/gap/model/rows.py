@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -53,8 +53,11 @@ class Rows:
         return int(self.gather.shape[0])
 
     def stack(self, rows: Mapping[str, jax.Array]) -> jax.Array:
-        """Rows of all observed sites, (component, *site) each, as (cluster, row), padded with zeros."""
-        return stacked(rows, self.gather)
+        """Rows of all observed sites, (component, *site) each, as (cluster, row), padded with zeros.
+
+        The sites come in the model's order, whatever the mapping's: what has been through `jax.jit` is in that of names.
+        """
+        return stacked([rows[name] for name in self.shapes], self.gather)
 
     def unstack(self, rows: np.ndarray) -> np.ndarray:
         """Rows (..., cluster, row) as (..., flat), as they lie in the observed sites one after another."""
@@ -86,9 +89,9 @@ class Rows:
         return np.concatenate([values, [-1]])[self.gather]
 
 
-def stacked(rows: Mapping[str, jax.Array], gather: Any) -> jax.Array:
-    """Rows of all observed sites by cluster: entries at the positions (cluster, row) of all, a zero behind the last."""
-    return jnp.concatenate([*(value.reshape(-1) for value in rows.values()), jnp.zeros(1)])[gather]
+def stacked(rows: Iterable[jax.Array], gather: Any) -> jax.Array:
+    """Rows of observed sites one after another by cluster: entries at positions (cluster, row), a zero behind the last."""
+    return jnp.concatenate([*(value.reshape(-1) for value in rows), jnp.zeros(1)])[gather]
 
 
 def make_rows(
