@@ -36,6 +36,7 @@ from dtprob.inference.fit import resolve
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Data, Model
 from dtprob.models.indices import check_indices
+from dtprob.models.support import check_support
 from dtprob.models.supported import differentiated_forwards
 
 _DEFAULT = Settings()
@@ -78,6 +79,7 @@ def diagnose(
     """
     engine = resolve(engine) if isinstance(engine, str) else engine
     check_indices(model, data)
+    check_support(model, data)
     problem = Problem(model, data, effects, cluster, reference)
     if problem.n_cluster < 4:
         raise InputError(

@@ -24,6 +24,7 @@ from dtprob.inference.svi import SVI
 from dtprob.inference.von_mises_em import VonMisesEM
 from dtprob.models.arguments import Model
 from dtprob.models.indices import check_indices
+from dtprob.models.support import check_support
 
 ENGINES: Mapping[str, type[AbstractEngine]] = {
     engine.name: engine
@@ -95,4 +96,5 @@ def fit(
     """
     used = resolve(engine, **settings)
     check_indices(model, data)
+    check_support(model, data)
     return used(key, model, data, options=options)

@@ -1,0 +1,105 @@
+"""Observed values that a model's distributions cannot take, to which NumPyro gives a density all the same."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+from dtprob.errors import InputError
+from dtprob.models.arguments import Data, Model, select_arguments, split_static
+from dtprob.models.declaration import NOT_TRACED, trace_model
+
+_WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
+_DRAWS: Final = 8
+"""Draws from the prior of which one has to allow a value: where a support ends may be unknown."""
+_ANY: Final = ("Real", "Complex", "Circular", "Sphere", "Simplex")
+"""Supports of which no value is refused: all numbers, angles counted from anywhere, and what sums to 1 but for rounding."""
+
+
+def check_support(model: Model, data: Data, where: str = "data") -> None:
+    """Run the model at draws from its prior, and look whether its observed distributions can take the values of the data.
+
+    Args:
+        model: a NumPyro model.
+        data: its arguments by name.
+        where: what to call them in an error.
+
+    Raises:
+        InputError: a value that counts is outside the support of its distribution at each draw.
+    """
+    arrays, static = split_static(select_arguments(model, data))
+
+    families: dict[str, str] = {}
+
+    def one(arrays: Mapping[str, Any], key: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
+        """Values and which are allowed."""
+        with numpyro.validation_enabled(is_validate=False):  # which makes densities at the ends infinite
+            trace = trace_model(model, eqx.combine(arrays, static), key)
+        seen = {n: site for n, site in trace.items() if site["type"] == "sample" and site["is_observed"]}
+        bounded = {n: site for n, site in seen.items() if _ends(site["fn"].support) is not None}
+        families.update({n: type(_unwrapped(site["fn"])).__name__ for n, site in bounded.items()})
+        values = {n: jnp.asarray(site["value"]) for n, site in bounded.items()}
+        return {n: (value, _allows(bounded[n]["fn"], value)) for n, value in values.items()}
+
+    keys = jax.random.split(jax.random.key(0), _DRAWS)
+    try:
+        if not jax.eval_shape(one, arrays, keys[0]):
+            return
+    except NOT_TRACED:
+        return  # which `declare` tells
+    found = jax.jit(lambda arrays, keys: jax.lax.map(lambda key: one(arrays, key), keys))(arrays, keys)
+    for name, family in families.items():  # the first of the model is named
+        values, allowed = found[name]
+        refused = ~np.asarray(allowed).any(axis=0)
+        if refused.any():
+            raise _refusal(f"{where}, observed site {name!r}", family, np.asarray(values[0]), refused)
+
+
+def _ends(support: Any) -> tuple[Any, ...] | None:
+    """The finite ends of a support; None of one of which nothing is refused."""
+    while hasattr(support, "base_constraint"):  # of independent entries
+        support = support.base_constraint
+    if type(support).__name__.strip("_") in _ANY:
+        return None
+    return tuple(getattr(support, end) for end in ("lower_bound", "upper_bound") if hasattr(support, end))
+
+
+def _allows(fn: Any, value: jax.Array) -> jax.Array:
+    """Which values (*batch) a distribution can take; those at an end of a continuous one if its density is finite there."""
+    inside, mask = fn.support(value), jnp.ones((), bool)
+    event = tuple(range(value.ndim - len(fn.event_shape), value.ndim))
+    if not fn.is_discrete:
+        at_end = sum((value == end for end in _ends(fn.support) or ()), jnp.zeros(value.shape, bool)) > 0
+        inside = jnp.where(at_end.any(axis=event), jnp.isfinite(fn.log_prob(value)), inside)
+    while isinstance(fn, _WRAPPERS):
+        if isinstance(fn, dist.MaskedDistribution):
+            own = jnp.asarray(fn._mask)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
+            mask = mask & own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
+        fn = fn.base_dist
+    counts = jnp.broadcast_to(mask, value.shape).any(axis=event)
+    return inside | ~counts
+
+
+def _unwrapped(fn: Any) -> Any:
+    while isinstance(fn, _WRAPPERS):
+        fn = fn.base_dist
+    return fn
+
+
+def _refusal(where: str, family: str, value: np.ndarray, refused: np.ndarray) -> InputError:
+    first = tuple(int(i) for i in np.argwhere(refused)[0])
+    got = np.array2string(value[first], separator=", ", threshold=8)
+    more = f" and {refused.sum() - 1} more" if refused.sum() > 1 else ""
+    return InputError(
+        where,
+        f"values that {family} can take",
+        f"{got} at [{', '.join(map(str, first))}]{more}",
+        "Correct them, mark them as missing, or observe a distribution that can take them",
+    )
