@@ -1,5 +1,6 @@
 """Files to named arrays, whatever the format. No format that can run code is read."""
 
+import csv
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -144,10 +145,23 @@ def _read_csv(path: Path) -> Arrays:
     if not all(pd.isna(cell) for cell in second[len(header) :]):
         got, remedy = f"{len(second)} cells in the first row, {len(header)} names", "Name every column"
         raise InputError(str(path), "a name for each column", got, remedy)
+    _check_lengths(path, len(header))
     names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
     unnamed = [name for name in names if name not in header]
     table = pd.read_csv(path, header=0, names=names, usecols=range(len(names)))
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
+
+
+def _check_lengths(path: Path, width: int) -> None:
+    """Refuse rows with more cells than there are names: of these pandas drops the last ones without a word."""
+    with path.open(newline="", encoding="utf-8-sig", errors="replace") as file:
+        lines = csv.reader(file)
+        for row in lines:
+            if any(cell.strip() for cell in row[width:]):
+                got, remedy = f"{len(row)}", "Write points in numbers, and quote words that hold commas"
+                raise InputError(
+                    f"{path}, line {lines.line_num}", f"{width} cells as in the first line", got, remedy
+                )
 
 
 def _read_parquet(path: Path) -> Arrays:

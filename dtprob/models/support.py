@@ -40,8 +40,7 @@ def check_support(model: Model, data: Data, where: str = "data") -> None:
 
     def one(arrays: Mapping[str, Any], key: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
         """Values and which are allowed."""
-        with numpyro.validation_enabled(is_validate=False):  # which makes densities at the ends infinite
-            trace = trace_model(model, eqx.combine(arrays, static), key)
+        trace = trace_model(model, eqx.combine(arrays, static), key)
         seen = {n: site for n, site in trace.items() if site["type"] == "sample" and site["is_observed"]}
         bounded = {n: site for n, site in seen.items() if _ends(site["fn"].support) is not None}
         families.update({n: type(_unwrapped(site["fn"])).__name__ for n, site in bounded.items()})
@@ -49,12 +48,13 @@ def check_support(model: Model, data: Data, where: str = "data") -> None:
         return {n: (value, _allows(bounded[n]["fn"], value)) for n, value in values.items()}
 
     keys = jax.random.split(jax.random.key(0), _DRAWS)
-    try:
-        if not jax.eval_shape(one, arrays, keys[0]):
-            return
-    except NOT_TRACED:
-        return  # which `declare` tells
-    found = jax.jit(lambda arrays, keys: jax.lax.map(lambda key: one(arrays, key), keys))(arrays, keys)
+    with numpyro.validation_enabled(is_validate=False):  # which makes densities at the ends infinite
+        try:
+            if not jax.eval_shape(one, arrays, keys[0]):
+                return
+        except NOT_TRACED:
+            return  # which `declare` tells
+        found = jax.jit(lambda arrays, keys: jax.lax.map(lambda key: one(arrays, key), keys))(arrays, keys)
     for name, family in families.items():  # the first of the model is named
         values, allowed = found[name]
         refused = ~np.asarray(allowed).any(axis=0)

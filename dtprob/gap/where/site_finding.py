@@ -55,11 +55,12 @@ def most_gained(found: Iterable[SiteFinding]) -> float:
 def most_left(found: Iterable[SiteFinding]) -> float:
     """Nats that are left at the worst of these sites at least.
 
-    Of a moment that nothing a model computes would move, such as what goes together, about -log p, as a likelihood ratio of
-    it would have; not where it may be the shadow of another site.
+    Of a moment, a spread or what goes together, about -log p at least, as a likelihood ratio of it would have: of a spread
+    that is far too small the first order tells a fraction. Not where it may be the shadow of another site.
     """
     sites = tuple(found)
-    told = (-math.log(max(one.p_value, 1e-300)) for one in sites if one.gain is None and not one.last)
+    moments = (one for one in sites if (one.spreads or one.moment is not None) and not one.last)
+    told = (-math.log(max(one.p_value, 1e-300)) for one in moments)
     return max(most_gained(sites), max(told, default=0.0))
 
 

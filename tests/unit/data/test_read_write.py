@@ -374,3 +374,15 @@ def test_rows_that_end_in_a_comma_do_not_shift_columns(tmp_path):
     (tmp_path / "t.csv").write_text("a,b\n1,2,3\n4,5,6\n")
     with pytest.raises(InputError, match="a name for each column, got 3 cells in the first row, 2 names"):
         read_table(tmp_path / "t.csv")
+
+
+def test_a_later_row_with_more_cells_is_refused(tmp_path):
+    """A decimal comma shifts what follows; pandas drops the last cell without a word."""
+    path = tmp_path / "t.csv"
+    path.write_text("d,p\n1.5,-60.1\n2,5,-61\n")
+    with pytest.raises(
+        InputError, match=r"t\.csv, line 3: expected 2 cells as in the first line, got 3\. Write points"
+    ):
+        read_table(path)
+    path.write_text('d,p\n1.5,-60.1,\n"2.5",-61\n\n')
+    assert read_table(path).columns["p"].tolist() == [-60.1, -61.0]
