@@ -57,6 +57,8 @@ def unknown_name(what: str, name: str, valid: Iterable[str], kind: str = "name")
     close = nearest(name, names)
     remedy = f"Did you mean '{close}'?" if close else f"Use a valid {kind}"
     shown = ", ".join(names) if len(names) <= 16 else ", ".join(names[:16]) + ", ..."
+    if not names:
+        return InputError(what, f"no {_plural(kind)}", f"'{name}'", "Leave it out")
     return InputError(what, f"one of the {_plural(kind)} {shown}", f"'{name}'", remedy)
 
 

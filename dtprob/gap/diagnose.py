@@ -134,15 +134,16 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     asked_for = _asked_for(last, settings)
     remains, left = bool(wrong), max([most_left(wrong), *map(last.screening.promise_of, asked_for)])
     floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
-    fraction = (
-        closed.closed_fraction(held_before, held_after, floor, keys[2]) if last.fitted.effects else None
-    )
     held = held_before, held_after
+    fraction = closed.closed_fraction(*held, floor, keys[2]) if last.fitted.effects else None
     parts = shares(last.problem, last.fitted, held, assignment, keys[2]) if fraction is not None else ()
     rest = None
     if remains and (fraction is None or fraction.mean < 1 - settings.minor):
         say("modelling what is left at its site")
         rest = model_remainder(last, folds, held_after, floor.best, keys[2])
+    if rest is not None:
+        floor = closed.shown(floor, held_after, rest.held)
+        fraction = closed.closed_fraction(*held, floor, keys[2]) if last.fitted.effects else None
     judged = problem, base, tuple(steps), held_before, held_after, floor, fraction, parts, noted
     return Evidence(*judged, remainder=rest, rivals=searched.rivals, asked_for=asked_for)
 

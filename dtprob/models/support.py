@@ -52,7 +52,7 @@ def check_support(model: Model, data: Data, where: str = "data") -> None:
         try:
             if not jax.eval_shape(one, arrays, keys[0]):
                 return
-        except NOT_TRACED:
+        except (*NOT_TRACED, NotImplementedError):
             return  # which `declare` tells
         found = jax.jit(lambda arrays, keys: jax.lax.map(lambda key: one(arrays, key), keys))(arrays, keys)
     for name, family in families.items():  # the first of the model is named

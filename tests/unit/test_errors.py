@@ -30,4 +30,5 @@ def test_unknown_name_asks_or_lists():
         ("kind of traffic", "kinds of traffic"),
     ]:
         assert f"one of the {kinds} a," in str(unknown_name("x", "a1", ["a", "b"], kind))
+    assert str(unknown_name("x", "q", [], "option")) == "x: expected no options, got 'q'. Leave it out."
     assert str(unknown_name("x", "q", [f"n{i}" for i in range(100, 130)])).count(",") == 17

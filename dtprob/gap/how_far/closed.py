@@ -209,6 +209,20 @@ def floor(problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: f
     return Floor(reached, reached + max(remaining_gain, 0.0), size, cost(size, n_folds))
 
 
+def shown(best: Floor, after: HeldOut, beyond: HeldOut) -> Floor:
+    """The floor once a model of what is left has shown on held-out clusters how much that is, within a standard error.
+
+    Args:
+        best: the floor that scores alone tell.
+        after: held-out results with the causes.
+        beyond: the same with what is left modelled, too.
+    """
+    gain = beyond.log_likelihood - after.log_likelihood
+    error = float(np.sqrt(len(gain)) * gain.std(ddof=1))
+    low, high = (best.low + max(float(gain.sum()) + side * error, 0.0) for side in (-1, 1))
+    return replace(best, low=low, high=max(best.high, high if low > best.low else best.low))
+
+
 def cost(parameters: float, n_folds: int) -> float:
     """Nats on held-out clusters that estimating d parameters from the share (K - 1) / K of all costs, d / 2 K / (K - 1)."""
     return 0.5 * parameters * n_folds / (n_folds - 1)

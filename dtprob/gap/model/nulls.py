@@ -72,7 +72,8 @@ def _check_slope(effect: Effect, values: Mapping[str, jax.Array], context: Conte
     moved = {name: jnp.asarray(value) + 1.0 for name, value in effect.null().items()}
     after = (rewritten(effect, site, values[site], moved, context) for site in effect.rewrites)
     acts = any(
-        (np.asarray(a) != np.asarray(values[s])).any() for a, s in zip(after, effect.rewrites, strict=True)
+        not np.array_equal(np.asarray(a), np.broadcast_to(values[s], np.shape(a)), equal_nan=True)
+        for a, s in zip(after, effect.rewrites, strict=True)
     )
     if acts:
         remedy = (

@@ -11,6 +11,7 @@ import numpy as np
 
 from dtprob.effects.effect import FIELD, Context, Effect
 from dtprob.effects.rewriting import Rewriting, rewritten
+from dtprob.errors import InputError
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import transform_of
 from dtprob.gap.model.running import Arrays, Runner, observations
@@ -120,7 +121,12 @@ def _largest(
             parameters[FIELD] = jnp.zeros(effect.shape_of_field(values[effect.sites[0]], context))
         for site in effect.rewrites:
             new = rewritten(effect, site, values[site], parameters, Context(data, before[site]))
-            shapes[site] = np.broadcast_shapes(shapes[site], jnp.shape(new))
+            try:
+                shapes[site] = np.broadcast_shapes(shapes[site], jnp.shape(new))
+            except ValueError:
+                what, wanted = f"effect {effect.name}", f"site {site!r} of a shape that fits {shapes[site]}"
+                remedy = "Return a value for each entry of the site, or one for all"
+                raise InputError(what, wanted, f"{jnp.shape(new)}", remedy) from None
     return shapes
 
 

@@ -121,6 +121,23 @@ def test_draws_keep_the_clusters_that_tell_alone():
     assert {*np.unique(drawn)} == {*range(6)}
 
 
+def test_what_a_model_of_the_remainder_reaches_is_known_to_be_left():
+    """A scores' guess of a fifth of what is left gave way: 1 of 3 parts closed, not most of it; a loss teaches nothing."""
+    rng = np.random.default_rng(1)
+    gain, beyond = 10 + rng.normal(size=400), 20 + rng.normal(size=400)
+    before, after, further = held(np.zeros(400)), held(gain), held(gain + beyond)
+    guessed = Floor(gain.sum(), gain.sum() + 0.1 * beyond.sum())
+    told = closed.shown(guessed, after, further)
+    error = np.sqrt(400) * beyond.std(ddof=1)
+    assert (told.low, told.high) == pytest.approx(
+        (gain.sum() + beyond.sum() - error, gain.sum() + beyond.sum() + error)
+    )
+    fraction = closed.closed_fraction(before, after, told, jax.random.key(0))
+    assert fraction is not None
+    assert fraction.mean == pytest.approx(1 / 3, abs=0.01)
+    assert closed.shown(guessed, after, held(gain - beyond)) == guessed
+
+
 def test_fraction_of_a_known_gap():
     rng = np.random.default_rng(0)
     gain = 10 + rng.normal(size=400)

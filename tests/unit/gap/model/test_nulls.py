@@ -54,6 +54,14 @@ def test_a_missing_value_in_a_column_of_an_effect_is_told():
         check_nulls(Problem(line, data, [marked]))
 
 
+def test_a_site_of_another_shape_is_told():
+    cut = Effect("cut", {"mean": lambda v, p, c: v[:3] + p["by"]}, (Parameter("by", dist.Normal()),))
+    with pytest.raises(
+        InputError, match=r"effect cut: expected site 'mean' of a shape that fits \(\d+, \d+\), got \(3, "
+    ):
+        check_nulls(Problem(line, draw("line"), [cut]))
+
+
 @pytest.mark.parametrize(
     ("rewrite", "message"),
     [

@@ -185,6 +185,8 @@ def test_what_goes_together_leaves_what_its_chance_tells_unless_it_is_a_shadow()
     assert most_left([values, together]) == pytest.approx(20 * np.log(10))
     assert most_left([values, replace(together, last=True)]) == 12.0
     assert most_left([]) == 0.0
+    small = replace(values, family="spread, by group", p_value=1e-40, gain=12.0)
+    assert most_left([small]) == pytest.approx(40 * np.log(10))
 
 
 def test_one_far_row_of_many_is_no_tail():
