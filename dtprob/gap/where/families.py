@@ -88,7 +88,7 @@ class Family:
     """A pattern times a factor.
 
     Attributes:
-        kind: what is added: "additive", "relative", "conjugate", "from the next <axis>", "location" or "spread".
+        kind: what is added: "additive", "relative", "conjugate", "from the next <axis>", "location", "spread" or "shape".
         pattern: how its weights vary.
         factor: by which the weights are multiplied, broadcasting to the site.
     """
@@ -148,17 +148,21 @@ def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients
 
 
 def observed(problem: Problem, rows: np.ndarray) -> Iterator[Site]:
-    """Spreads of what is observed, from projected rows (n, cluster, row); locations too where the model names no site."""
+    """Spreads of what is observed, from projected rows (n, cluster, row); locations too where the model names no site.
+
+    What rows of a mixture tell beside (where its parts lie, how often each comes) is its shape.
+    """
     for name, own in problem.rows.by_site(rows).items():
         site, count = problem.declaration.observed[name], own.shape[1]
         located = problem.located[name]
         complex_parts = 2 if likelihood(problem.families[name]).is_complex else 1
-        for kind, moved in (("location", range(complex_parts)), ("spread", range(located, located + 1))):
-            wanted = located < count if kind == "spread" else not problem.float_sites
-            if wanted:
-                part = own[:, moved[0]] if len(moved) == 1 else own[:, moved[0]] - 1j * own[:, moved[1]]
-                value = np.ones(site.shape, part.dtype)
-                yield Site(name, site.axes, value, part, {kind: np.ones(())}, tuple(moved))
+        kinds = [("location", range(complex_parts))] if not problem.float_sites else []
+        kinds += [("spread", range(located, located + 1))] if located < count else []
+        kinds += [("shape", range(row, row + 1)) for row in range(located + 1, count)]
+        for kind, moved in kinds:
+            part = own[:, moved[0]] if len(moved) == 1 else own[:, moved[0]] - 1j * own[:, moved[1]]
+            value = np.ones(site.shape, part.dtype)
+            yield Site(name, site.axes, value, part, {kind: np.ones(())}, tuple(moved))
 
 
 def shifted(problem: Problem, x: np.ndarray, site: Site, steps: np.ndarray) -> np.ndarray:

@@ -41,7 +41,11 @@ class Suspect:
 def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
     """The families of a site that have the most evidence, ripples also narrowed to the half waves that bring it."""
     whole = [
-        test for test in tests if test.variance.size <= _MOST_WEIGHTS and not _overlaps(test.family.pattern)
+        test
+        for test in tests
+        if test.variance.size <= _MOST_WEIGHTS
+        and not _overlaps(test.family.pattern)
+        and test.family.kind != "shape"  # which no parameter that all distributions have moves
     ]
     choice = float(np.log(max(len(whole), 1)))
     found = [_suspect(site, test, choice) for test in whole]
