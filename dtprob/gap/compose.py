@@ -201,6 +201,7 @@ def _screening(evidence: Evidence) -> list[dict[str, Any]]:
             "adjusted_p_value": first.adjusted[i],
             "absorbed_by": None if first.names[i] in refitted else first.absorbed_by[i],
             "opposite": first.opposite[i],
+            "beyond": first.beyond[i],
         }
         for i in map(int, order)
     ]

@@ -186,7 +186,8 @@ class Detectable(TypedDict):
 class Candidate(TypedDict):
     """One line of the screening; an effect that a fitted parameter absorbs, or that nothing shows, has no statistic.
 
-    Of an `opposite` one the data ask for the side of its size that its prior excludes.
+    Of an `opposite` one the data ask for the side of its size that its prior excludes; of one with `beyond` for a size so
+    many standard deviations of its prior from the middle.
     """
 
     effect: str
@@ -196,6 +197,7 @@ class Candidate(TypedDict):
     adjusted_p_value: Probability | None
     absorbed_by: NotRequired[str | None]
     opposite: NotRequired[bool]
+    beyond: NotRequired[Number]
     kind: NotRequired[str]
 
 

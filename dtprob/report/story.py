@@ -244,7 +244,7 @@ def _unlisted(report: Report) -> Story:
         "unknown",
         "There is a gap, and none of the known effects explains it.",
         f"{real}, but no effect on the list accounts for it: something remains with the best of them, too.",
-        f"Do not add a listed effect: it would hide the problem, not solve it. {look}{_opposite(report)}",
+        f"Do not add a listed effect: it would hide the problem, not solve it. {look}{_opposite(report)}{_beyond(report)}",
     )
 
 
@@ -259,6 +259,19 @@ def _opposite(report: Report) -> str:
     more, its = " even more" * bool(named), "its size is" if len(asked) == 1 else "their sizes are"
     return (
         f" The data ask{more} for the opposite of {listing(asked[:3])}: look whether {its} of the right sign."
+    )
+
+
+def _beyond(report: Report) -> str:
+    """The effect that the data ask for most, where they ask for more of it than its prior allows."""
+    rows = [row for row in report.get("screening", []) if row["z"] is not None and not row.get("absorbed_by")]
+    most = max(rows, key=lambda row: abs(row["z"] or 0.0), default=None)
+    far = most.get("beyond") if most is not None else None
+    if most is None or far is None or most.get("opposite"):
+        return ""
+    return (
+        f" Most of all the data ask for {words(most['effect'])}, but {far:.0f} standard deviations of its prior from its"
+        " middle: if it can be so large, give it a wider prior and diagnose again."
     )
 
 

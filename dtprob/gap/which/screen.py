@@ -11,7 +11,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
-import jax
 import numpy as np
 from scipy import stats
 
@@ -19,30 +18,24 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.bootstrap import Replicates, more
-from dtprob.gap.fitting.plausible import is_one_sided, log_bayes_factor, scales, sizes
+from dtprob.gap.fitting.plausible import is_one_sided, scales, sizes
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.fitting.soundness import UNSEEN
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
-from dtprob.gap.tails import (
-    LOG_SMALLEST,
-    any_of,
-    deviation,
-    effective_tests,
-    log_gamma_tail,
-    normal_quantile,
-)
+from dtprob.gap.tails import any_of, deviation, effective_tests
 from dtprob.gap.which.detectable import Detectable, detectable
-from dtprob.gap.which.directions import Tangents, surroundings, tangents
+from dtprob.gap.which.directions import surroundings, tangents
 from dtprob.gap.which.fields import tests_of_fields
-from dtprob.gap.which.pairs import Pair, best_pairs
 from dtprob.gap.which.places import Placed
+from dtprob.gap.which.scores import NOTHING, Scores, mean_scores, mean_tests
 
 _ABSORBED = 0.98
 _SEEN = 25.0
 _SHOWN = 10.0
 """Nats of an effect that the data show, however much of it nuisances could take up."""
-_NOTHING = 1e-9
+_FAR = 4.0
+"""Standard deviations of its prior from which on a size is one that the prior all but excludes."""
 _SURE = 1e-6
 """Family-wise p-value of a random field at which a gap is sure, however skew its energy is."""
 
@@ -60,6 +53,8 @@ class Screening:
         step: one-step estimate of each mean effect's parameters, flat.
         absorbed_by: the nuisance that hides the candidate, if one does.
         opposite: whether the data surely ask for a size on the side that the prior of the candidate's only one excludes.
+        beyond: standard deviations of the prior of the candidate's only size to what the data alone ask for, to first order
+            where they surely ask for it and it is far; None elsewhere.
         detectable: from which size on each would be noticed nine times in ten; None of random fields and where none is.
         correlation: of the candidates' scores after adjustment; aliases are near +-1.
         locates: whether a candidate says how the expected observations move, not only how they spread.
@@ -74,6 +69,7 @@ class Screening:
     step: dict[str, np.ndarray]
     absorbed_by: tuple[str | None, ...]
     opposite: tuple[bool, ...]
+    beyond: tuple[float | None, ...]
     detectable: tuple[Detectable | None, ...]
     correlation: np.ndarray
     locates: tuple[bool, ...]
@@ -119,7 +115,7 @@ def screen(
     )
     scores = replace(told, price=np.array([placed[e.name].price if e.name in placed else 0.0 for e in means]))
     tested = tests_of_fields(problem, around, fields, drawn, placed)
-    (mean_p, mean_z), null_p = _mean_tests(scores, scores.u[None]), _mean_tests(scores, scores.u_null)[0]
+    (mean_p, mean_z), null_p = mean_tests(scores, scores.u[None]), mean_tests(scores, scores.u_null)[0]
     for k, found in ((k, placed[e.name]) for k, e in enumerate(means) if e.name in placed):
         mean_p[0, k], null_p[:, k] = found.p_value, 1.0
         one_sided = is_one_sided(means[k])
@@ -139,6 +135,10 @@ def screen(
     sided = [k for k, e in enumerate(means) if _is_half(e) and e.name not in placed]
     below = any_of(stats.norm.cdf(mean_z[0, sided]), tests) <= settings.level / 2
     opposite = {means[k].name for k, is_below in zip(sided, below, strict=True) if is_below}
+    alone = [k for k, e in enumerate(means) if len(sizes(e)) == 1 and e.name not in placed]
+    sure = any_of(mean_p[0, alone], tests) <= settings.level / 2
+    asked = {means[k].name: scores.asked(k) for k, is_sure in zip(alone, sure, strict=True) if is_sure}
+    beyond = {name: size for name, size in asked.items() if size > _FAR}
     log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
     return Screening(
         names=tuple(c.name for c in candidates),
@@ -149,6 +149,7 @@ def screen(
         step={e.name: scores.step(k) for k, e in enumerate(means)},
         absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),
         opposite=tuple(c.name in opposite for c in candidates),
+        beyond=tuple(beyond.get(c.name) for c in candidates),
         detectable=tuple(_detectable(scores, c, settings) for c in candidates),
         correlation=_correlation(candidates, scores),
         locates=tuple(c.name in scores.locating for c in candidates),
@@ -173,129 +174,6 @@ def _is_open(fields: np.ndarray, means: np.ndarray, tests: float, settings: Sett
     least = fields.min(initial=1.0)
     is_open = _SURE < float(any_of(least, tests)) <= settings.level / 2
     return is_open and bool(least < means.min(initial=1.0))
-
-
-@dataclass(frozen=True)
-class Scores:
-    """Adjusted scores of mean effects: u of the data and of the replicates, information, and what was projected away.
-
-    `price` is what the best of many places costs each effect, in nats; `locating` are the effects most of whose
-    information is in the location of observations, not in their spread.
-    """
-
-    effects: tuple[Effect, ...]
-    groups: tuple[np.ndarray, ...]
-    u: np.ndarray
-    u_null: np.ndarray
-    information: np.ndarray
-    total: np.ndarray
-    coefficients: np.ndarray
-    price: np.ndarray
-    locating: frozenset[str]
-
-    def part(self, k: int) -> np.ndarray:
-        """Information of one effect's own parameters."""
-        return self.information[np.ix_(self.groups[k], self.groups[k])]
-
-    def root(self, k: int) -> np.ndarray:
-        """Columns that whiten one effect's scores, one per direction that the data can see."""
-        size = np.sqrt(np.maximum(self.total[self.groups[k]], 1e-300))
-        values, vectors = np.linalg.eigh(self.part(k) / np.outer(size, size))
-        keep = values > _NOTHING
-        return vectors[:, keep] / np.sqrt(values[keep]) / size[:, None]
-
-    def step(self, k: int) -> np.ndarray:
-        """One-step estimate of one effect's parameters."""
-        return np.linalg.solve(
-            self.part(k) + np.diag(scales(self.effects[k]) ** -2.0), self.u[self.groups[k]]
-        )
-
-    @property
-    def log_bayes_factor(self) -> np.ndarray:
-        """Of each effect, the scale of its prior mixed, see `dtprob.gap.fitting.plausible`, its place paid for."""
-        pairs = zip(self.effects, self.groups, strict=True)
-        return np.array([self._evidence(effect, group) for effect, group in pairs]) - self.price
-
-    def _evidence(self, effect: Effect, group: np.ndarray) -> float:
-        """Places tell nothing beside the null."""
-        index = sizes(effect)
-        own = group[index]
-        information, scale = self.information[np.ix_(own, own)], scales(effect)[index]
-        return log_bayes_factor(information, self.u[own], scale, one_sided=is_one_sided(effect))
-
-    def pairs(self) -> tuple[Pair, ...]:
-        """The pairs that explain most together; costly, so made when asked for."""
-        return best_pairs(
-            self.effects, self.groups, self.information, self.u, self.log_bayes_factor, price=self.price
-        )
-
-
-def mean_scores(problem: Problem, projection: Projection, drawn: Replicates, found: Tangents) -> Scores:
-    """Scores of mean effects, of the data and of the replicates.
-
-    Args:
-        problem: the model on its data.
-        projection: at the fit.
-        drawn: the data and replicates at the fit.
-        found: the effects' tangents there.
-    """
-    information, coefficients = projection.information(found.columns)
-    total = np.einsum("cmi,cmi->i", found.columns, found.columns)
-    located = np.maximum(problem.rows.by_cluster(problem.rows.located), 0.0)
-    of_location = np.einsum("cmi,cmi,cm->i", found.columns, found.columns, located)
-    u = _products(projection.adjoint(drawn.raw), found)
-    values = problem.observed.values
-    for effect, group in zip(found.effects, found.groups, strict=True):
-        for extra in found.extra[effect.name]:
-            own = extra.shift.T @ extra.shift
-            information[np.ix_(group, group)] += own
-            total[group] += np.diag(own)
-            u[group] += extra.score(values[extra.site][None])[0]
-    u_null = np.concatenate([_replicate_scores(projection, found, *portion) for portion in drawn.portions()])
-    information = (information + information.T) / 2
-    pairs = zip(found.effects, found.groups, strict=True)
-    locating = frozenset(e.name for e, g in pairs if (2 * of_location[g] > total[g]).any())
-    free, coefficients = np.zeros(len(found.effects)), np.asarray(coefficients)
-    return Scores(
-        found.effects, found.groups, u, u_null, information, total, coefficients, free, locating=locating
-    )
-
-
-def _replicate_scores(
-    projection: Projection, found: Tangents, rows: np.ndarray, values: Mapping[str, jax.Array]
-) -> np.ndarray:
-    """Scores (replicate, column) of mean effects."""
-    u = _products(projection.adjoint(rows), found)
-    for effect, group in zip(found.effects, found.groups, strict=True):
-        for extra in found.extra[effect.name]:
-            u[:, group] += extra.score(values[extra.site])
-    return u
-
-
-def _products(rows: np.ndarray, found: Tangents) -> np.ndarray:
-    """Products (..., column) of rows (..., cluster, row) with the columns of mean effects."""
-    clusters, entries, count = found.columns.shape
-    flat = rows.reshape(*rows.shape[:-2], clusters * entries)
-    return flat @ found.columns.reshape(clusters * entries, count)
-
-
-def _mean_tests(scores: Scores, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """p-values and z of score vectors u (n, columns) for each effect, (n, effect)."""
-    p, z = np.ones((len(u), len(scores.effects))), np.zeros((len(u), len(scores.effects)))
-    for k, (effect, group) in enumerate(zip(scores.effects, scores.groups, strict=True)):
-        root = scores.root(k)
-        if not root.shape[1]:
-            continue
-        t = u[:, group] @ root
-        index = sizes(effect)
-        if len(index) == 1:
-            z[:, k] = t[:, 0] * np.sign(root[index[0], 0])
-            p[:, k] = stats.norm.sf(z[:, k]) if is_one_sided(effect) else 2 * stats.norm.sf(np.abs(z[:, k]))
-        else:
-            square, d = (t**2).sum(1), root.shape[1]
-            log_p = log_gamma_tail(square / 2, d / 2)
-            p[:, k], z[:, k] = np.exp(np.maximum(log_p, LOG_SMALLEST)), normal_quantile(log_p)
-    return np.maximum(p, 1e-300), z
 
 
 def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Effect) -> str | None:
@@ -327,7 +205,7 @@ def _detectable(scores: Scores, effect: Effect, settings: Settings) -> Detectabl
     k = [e.name for e in scores.effects].index(effect.name)
     own, total = np.diag(scores.part(k)), scores.total[scores.groups[k]]
     level = settings.level / (2 * max(len(scores.effects), 1) * float(np.exp(scores.price[k])))
-    return detectable(effect, np.where(own > _NOTHING * total, own, 0.0), scores.root(k).shape[1], level)
+    return detectable(effect, np.where(own > NOTHING * total, own, 0.0), scores.root(k).shape[1], level)
 
 
 def _correlation(candidates: list[Effect], scores: Scores) -> np.ndarray:

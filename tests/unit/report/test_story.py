@@ -215,6 +215,15 @@ def test_effects_whose_opposite_the_data_ask_for_are_named() -> None:
         assert "ask for the opposite of dry step: look whether its size" in tell(other).action
 
 
+def test_a_size_that_only_its_prior_forbids_is_said() -> None:
+    report = {**_report(), "verdict": "UNLISTED", "causes": []}
+    near, far = report["screening"][:2]
+    for z, said in ((9.3, True), (0.5, False)):  # only of what the data ask for most
+        rows = [near, {**far, "effect": "body", "z": z, "beyond": 6.2}]
+        action = tell({**report, "screening": rows}).action
+        assert ("ask for body, but 6 standard deviations of its prior" in action) == said
+
+
 def test_what_cannot_be_judged_is_said_with_its_reason() -> None:
     report = {**_report(), "verdict": "NO_GAP"}
     idle = {**report["screening"][2], "effect": "d", "absorbed_by": UNSEEN}

@@ -20,7 +20,7 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.tails import deviation, gamma_tail
 from dtprob.gap.which.directions import surroundings, tangents
 from dtprob.gap.which.places import Placed, place
-from dtprob.gap.which.screen import Scores, mean_scores
+from dtprob.gap.which.scores import Scores, mean_scores
 
 _NOTHING = 1e-300
 

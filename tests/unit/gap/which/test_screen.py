@@ -51,6 +51,18 @@ def test_what_the_data_show_is_not_absorbed(size, hidden_by):
     assert seen.screening.absorbed_by == (hidden_by,)
 
 
+@pytest.mark.parametrize(
+    ("size", "deviation", "far"), [(3.5, 2.0, False), (3.5, 0.5, True), (0.0, 0.01, False)]
+)
+def test_what_a_prior_all_but_excludes_is_told(size, deviation, far):
+    problem = Problem(slope, data_with(size), [nearly_the_slope(dist.Normal(0.0, deviation))])
+    base = fitting.fit(problem, problem.null())
+    seen = view(problem, base, jax.random.key(0), Settings(replicates=100, site_replicates=19), located=False)
+    (beyond,) = seen.screening.beyond
+    assert (beyond is not None) == far
+    assert beyond is None or beyond == pytest.approx(3.5 / deviation, rel=0.2)
+
+
 @pytest.mark.parametrize(("size", "opposite"), [(3.5, False), (0.0, False), (-3.5, True)])
 def test_what_the_data_ask_for_on_the_side_that_a_prior_excludes(size, opposite):
     problem = Problem(slope, data_with(size), [nearly_the_slope(dist.HalfNormal(2.0))])
