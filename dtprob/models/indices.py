@@ -8,6 +8,7 @@ from typing import Any, Final
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.experimental import checkify
 
@@ -47,8 +48,12 @@ def check_indices(model: Model, data: Data, where: str = "data") -> None:
         return  # which `declare` tells
     if all(_is_within(column, size) for column in whole.values() for size in sizes):
         return  # without compiling anything
-    found, _ = jax.jit(checkify.checkify(run, errors=checkify.index_checks))(arrays, key)
-    said = _SAID.search(found.get() or "")
+    checked = jax.jit(checkify.checkify(run, errors=checkify.index_checks))
+
+    def says(arrays: Mapping[str, Any]) -> re.Match[str] | None:
+        return _SAID.search(checked(arrays, key)[0].get() or "")
+
+    said = says(arrays)
     if said is None:
         return
     index, size = map(int, said.groups())
@@ -56,7 +61,13 @@ def check_indices(model: Model, data: Data, where: str = "data") -> None:
         n: c for n, c in whole.items() if np.isin(c, (index, index - size)).any() and not _is_within(c, size)
     }
     if size in sizes and beyond:
-        name, column = next(iter(beyond.items()))
+        # of several columns that hold the number, the one without which nothing points there
+        cut = {n: {**arrays, n: jnp.clip(arrays[n], -size, size - 1)} for n in beyond}
+        after = {n: says(without) for n, without in cut.items()} if len(beyond) > 1 else {}
+        name = next(
+            (n for n, still in after.items() if still is None or still[0] != said[0]), next(iter(beyond))
+        )
+        column = beyond[name]
         raise InputError(
             f"{where} {name!r}",
             f"indices from 0 to {size - 1} of an array of {size}",

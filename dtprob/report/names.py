@@ -50,7 +50,7 @@ _SITES = {
     "device_advantage": "chances of each device to be heard",
     "predicted_label": "predicted labels",
     "label_deviation": "size of the labels' errors",
-    "y": "labels",
+    "y": "readings",
 }
 
 LEVEL = 0.05

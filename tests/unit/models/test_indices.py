@@ -102,3 +102,14 @@ def test_neither_fit_nor_diagnosis_takes_another_entry_without_a_word():
         dtprob.fit(levels, table(SITES), engine="laplace", key=jax.random.key(0))
     with pytest.raises(InputError, match="'site'"):
         diagnose(levels, table(SITES), key=jax.random.key(0), engine=Laplace(), cluster="site")
+
+
+def test_of_columns_that_hold_the_number_the_one_that_points_is_named():
+    """A count of packets may be as large as a wrong number of a site."""
+
+    def counted(packets, site, y=None):
+        return levels(site, y - 0.0 * packets if y is not None else None)
+
+    data = {"packets": jnp.array([7, 3, 6]), "site": jnp.array([0, 7, 1]), "y": jnp.zeros(3)}
+    with pytest.raises(InputError, match="'site'"):
+        check_indices(counted, data)

@@ -171,9 +171,9 @@ def test_a_value_that_is_wrong_calls_for_physics() -> None:
     spread: names.Site = {"site": "y", "p_value": 1e-3, "share": None, "family": "spread, by wall"}
     assert "Look for physics" in tell(_unlisted(values, spread)).action
     assert (
-        "change the range and change the spread of the labels" not in tell(_unlisted(values, spread)).action
+        "change the range and change the spread of the readings" not in tell(_unlisted(values, spread)).action
     )
-    assert "change the spread of the labels, or declare" in tell(_unlisted(spread)).action
+    assert "change the spread of the readings, or declare" in tell(_unlisted(spread)).action
 
 
 def test_a_site_that_is_wrong_in_two_ways_is_told_as_it_is_most_surely() -> None:
@@ -182,9 +182,9 @@ def test_a_site_that_is_wrong_in_two_ways_is_told_as_it_is_most_surely() -> None
         for p, f in ((1e-9, "tails"), (1e-3, "spread"))
     ]
     report = {**_unlisted(), "unlisted": {"p_value": 1e-9, "sites": ["y"], "located": two}}
-    assert [names.located_words(site) for site in left_over(report)] == ["tails of the labels"]
+    assert [names.located_words(site) for site in left_over(report)] == ["tails of the readings"]
     bare = {**report, "unlisted": {"p_value": 1e-9, "sites": ["y"]}}
-    assert [names.located_words(site) for site in left_over(bare)] == ["labels"]
+    assert [names.located_words(site) for site in left_over(bare)] == ["readings"]
 
 
 def _report(**terms: list[float]) -> names.Any:
