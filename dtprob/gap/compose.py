@@ -23,6 +23,8 @@ from dtprob.gap.which.trials import credit
 from dtprob.inference.engine import AbstractEngine
 
 _DRAWS = 200
+_MOST = 0.5
+"""Share of the gap from which causes close most of it."""
 _MOST_ALIKE = 300
 """Candidates up to which a report tells how much each looks like each."""
 
@@ -90,7 +92,8 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence, *, tole
         case "LISTED":
             return f"The gap comes from {name}{closed_part}."
         case "LISTED_WITH_REMAINDER":
-            return f"Most of the gap comes from {name}{closed_part}; {_rest(evidence)} left."
+            much = "Part" if best and best.closed_fraction and best.closed_fraction.mean < _MOST else "Most"
+            return f"{much} of the gap comes from {name}{closed_part}; {_rest(evidence)} left."
         case "UNLISTED":
             sites = ", ".join(_place(s) for s in evidence.after.sites[:2] if s.p_value <= 0.01)
             tail = f" It shows at {sites}." if sites else ""

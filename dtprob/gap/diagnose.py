@@ -40,6 +40,8 @@ from dtprob.models.support import check_support
 from dtprob.models.supported import differentiated_forwards
 
 _DEFAULT = Settings()
+_SOME = 0.2
+"""Share of the gap that causes close at least, surely, where what is left is of another kind."""
 
 
 def diagnose(
@@ -201,6 +203,7 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
     if cause.closed_fraction is None:
         return "UNLISTED" if remains else "UNDETERMINED"
     is_poor = cause.closed_fraction.mean < _relevance(evidence, settings)
+    is_poor = is_poor and not (cause.closed_fraction.low >= _SOME and _leaves_moments(evidence, level))
     is_too_large = not cause.plausible and _are_fields(evidence)
     if remains and (is_poor or is_too_large):
         return "UNLISTED"
@@ -210,6 +213,17 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
         # equally good sets that all leave something are imitations
         return "UNLISTED" if leaves and remains else "UNDETERMINED"
     return "LISTED_WITH_REMAINDER" if leaves else "LISTED"
+
+
+def _leaves_moments(evidence: Evidence, level: float) -> bool:
+    """Whether all that is left is how observations spread, of which what moves only expectations is no imitation."""
+    left = [s for s in evidence.after.sites if s.p_value <= level and not s.last]
+    locating = evidence.steps[0].view.screening.scores.locating
+    return (
+        bool(left)
+        and set(evidence.accepted) <= locating
+        and all(s.spreads or s.moment is not None for s in left)
+    )
 
 
 def _relevance(evidence: Evidence, settings: Settings) -> float:

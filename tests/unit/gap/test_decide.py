@@ -9,18 +9,20 @@ from dtprob.gap.diagnose import decide
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.settings import Settings
+from dtprob.gap.where.site_finding import SiteFinding
 from dtprob.gap.which.trials import Start, Trials, best, credit
 
 
-def evidence(kind, p_after, asked_for=()):
+def evidence(kind, p_after, asked_for=(), left="additive, common", *, locates=True):
     """What `decide` looks at: one accepted effect of a kind, and the sites' p-value beside it."""
-    view = SimpleNamespace(alarmed=lambda settings: True)
+    scores = SimpleNamespace(locating=frozenset({"a"} if locates else ()))
+    view = SimpleNamespace(alarmed=lambda settings: True, screening=SimpleNamespace(scores=scores))
     return SimpleNamespace(
         problem=SimpleNamespace(effects=[SimpleNamespace(name="a", kind=kind)]),
         accepted=("a",),
         steps=[SimpleNamespace(view=view)],
         before=SimpleNamespace(site_p_value=1e-9),
-        after=SimpleNamespace(site_p_value=p_after),
+        after=SimpleNamespace(site_p_value=p_after, sites=(SiteFinding("y", left, p_after, 9.0),)),
         asked_for=asked_for,
     )
 
@@ -48,6 +50,22 @@ def cause(closed, probability=0.99, plausible=True):
 )
 def test_verdicts(kind, closed, p_after, verdict):
     assert decide(evidence(kind, p_after), (cause(closed),), Settings()) == verdict
+
+
+@pytest.mark.parametrize(
+    ("left", "locates", "closed", "verdict"),
+    [
+        ("spread, by group", True, 0.37, "LISTED_WITH_REMAINDER"),
+        ("tails, common", True, 0.37, "LISTED_WITH_REMAINDER"),
+        ("spread, by group", True, 0.25, "UNLISTED"),
+        ("spread, by group", False, 0.37, "UNLISTED"),
+        ("relative, by group", True, 0.37, "UNLISTED"),
+    ],
+)
+def test_what_moves_expectations_imitates_no_spread(left, locates, closed, verdict):
+    """A shift of one group beside a spread of another: both are there, and the shift is named for its share."""
+    found = evidence("mean", 1e-6, left=left, locates=locates)
+    assert decide(found, (cause(closed),), Settings()) == verdict
 
 
 @pytest.mark.parametrize(
