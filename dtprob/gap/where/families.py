@@ -250,7 +250,8 @@ def _stretches(site: Site) -> Iterator[Pattern]:
             yield Pattern(found.label, (0,), found)
             continue
         each = Curves(
-            f"{found.label} x {site.axes[0]}", sparse.kron(sparse.identity(shape[0]), found.values, "csr")
+            f"{found.label} x {site.axes[0]}",
+            sparse.csr_matrix(sparse.kron(sparse.identity(shape[0]), found.values)),
         )
         yield Pattern(each.label, (0, 1), each)
         for first in stretches(shape[0], site.axes[0]):
@@ -262,7 +263,9 @@ def _stretches(site: Site) -> Iterator[Pattern]:
 def _crossed(label: str, first: Curves, second: Curves) -> Curves:
     """Every stretch of a first axis with every one of a second."""
     places = tuple(f"{one}, {other}" for one, other in itertools.product(first.places, second.places))
-    return Curves(label, sparse.kron(first.values, second.values, "csr"), overlaps=True, places=places)
+    return Curves(
+        label, sparse.csr_matrix(sparse.kron(first.values, second.values)), overlaps=True, places=places
+    )
 
 
 def _cycles(site: Site) -> Iterator[Pattern]:
