@@ -147,7 +147,7 @@ WRONG_INPUT = {
     "option": (
         lambda case: change(case, "[data]", "[model.options]\nz = 1\n[data]"),
         (),
-        "[model.options]: expected one of the options",
+        "[model.options]: expected no options, got 'z'",
     ),
     "effects": (
         lambda case: change(case, "line_effects:bias", "line_model:line"),
