@@ -250,7 +250,9 @@ def _unlisted(report: Report) -> Story:
 
 def _opposite(report: Report) -> str:
     """Which effects the data ask for with the sign that their priors exclude; beside a cause those asked for more."""
-    rows = [row for row in report.get("screening", []) if row["z"] is not None]
+    rows = sorted(
+        report.get("screening", []), key=lambda row: row["z"] or 0.0
+    )  # those that are asked for most first
     named = set(report["causes"][0]["effects"]) if report["verdict"] in _NAMING else set[str]()
     least = max((row["z"] or 0.0 for row in rows if row["effect"] in named), default=0.0)
     asked = [words(row["effect"]) for row in rows if row.get("opposite") and -(row["z"] or 0.0) > least]
