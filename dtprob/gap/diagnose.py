@@ -76,8 +76,9 @@ def diagnose(
 
     Raises:
         InputError: effects on absent sites, effects that change the model at their null, fewer than four
-            clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end, a base
-            model that does not fit, or one that meets the data exactly.
+            clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end,
+            observed values that their distribution cannot take, a base model that does not fit, or one that meets the data
+            exactly.
     """
     engine = resolve(engine) if isinstance(engine, str) else engine
     check_indices(model, data)

@@ -92,7 +92,8 @@ def fit(
         settings: the engine's own, such as `draws`.
 
     Raises:
-        InputError: see `resolve` and `AbstractEngine`; or an index in data beyond an array's end.
+        InputError: see `resolve` and `AbstractEngine`; an index in data beyond an array's end; or an observed value
+            that its distribution cannot take.
     """
     used = resolve(engine, **settings)
     check_indices(model, data)

@@ -10,13 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
-import numpyro.distributions as dist
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, select_arguments, split_static
-from dtprob.models.declaration import NOT_TRACED, trace_model
+from dtprob.models.declaration import NOT_TRACED, base_constraint, trace_model
+from dtprob.models.wrapping import unwrapped
 
-_WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
 _DRAWS: Final = 8
 """Draws from the prior of which one has to allow a value: where a support ends may be unknown."""
 _ANY: Final = ("Real", "Complex", "Circular", "Sphere", "Simplex")
@@ -43,7 +42,7 @@ def check_support(model: Model, data: Data, where: str = "data") -> None:
         trace = trace_model(model, eqx.combine(arrays, static), key)
         seen = {n: site for n, site in trace.items() if site["type"] == "sample" and site["is_observed"]}
         bounded = {n: site for n, site in seen.items() if _ends(site["fn"].support) is not None}
-        families.update({n: type(_unwrapped(site["fn"])).__name__ for n, site in bounded.items()})
+        families.update({n: type(unwrapped(site["fn"])[0]).__name__ for n, site in bounded.items()})
         values = {n: jnp.asarray(site["value"]) for n, site in bounded.items()}
         return {n: (value, _allows(bounded[n]["fn"], value)) for n, value in values.items()}
 
@@ -64,33 +63,20 @@ def check_support(model: Model, data: Data, where: str = "data") -> None:
 
 def _ends(support: Any) -> tuple[Any, ...] | None:
     """The finite ends of a support; None of one of which nothing is refused."""
-    while hasattr(support, "base_constraint"):  # of independent entries
-        support = support.base_constraint
-    if type(support).__name__.strip("_") in _ANY:
+    one = base_constraint(support)
+    if type(one).__name__.strip("_") in _ANY:
         return None
-    return tuple(getattr(support, end) for end in ("lower_bound", "upper_bound") if hasattr(support, end))
+    return tuple(getattr(one, end) for end in ("lower_bound", "upper_bound") if hasattr(one, end))
 
 
 def _allows(fn: Any, value: jax.Array) -> jax.Array:
     """Which values (*batch) a distribution can take; those at an end of a continuous one if its density is finite there."""
-    inside, mask = fn.support(value), jnp.ones((), bool)
+    inside, (_, mask) = fn.support(value), unwrapped(fn)
     event = tuple(range(value.ndim - len(fn.event_shape), value.ndim))
     if not fn.is_discrete:
         at_end = sum((value == end for end in _ends(fn.support) or ()), jnp.zeros(value.shape, bool)) > 0
         inside = jnp.where(at_end.any(axis=event), jnp.isfinite(fn.log_prob(value)), inside)
-    while isinstance(fn, _WRAPPERS):
-        if isinstance(fn, dist.MaskedDistribution):
-            own = jnp.asarray(fn._mask)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-            mask = mask & own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
-        fn = fn.base_dist
-    counts = jnp.broadcast_to(mask, value.shape).any(axis=event)
-    return inside | ~counts
-
-
-def _unwrapped(fn: Any) -> Any:
-    while isinstance(fn, _WRAPPERS):
-        fn = fn.base_dist
-    return fn
+    return inside if mask is None else inside | ~jnp.broadcast_to(mask, value.shape).any(axis=event)
 
 
 def _refusal(where: str, family: str, value: np.ndarray, refused: np.ndarray) -> InputError:

@@ -250,9 +250,7 @@ def _unlisted(report: Report) -> Story:
 
 def _opposite(report: Report) -> str:
     """Which effects the data ask for with the sign that their priors exclude; beside a cause those asked for more."""
-    rows = sorted(
-        report.get("screening", []), key=lambda row: row["z"] or 0.0
-    )  # those that are asked for most first
+    rows = sorted(report.get("screening", []), key=lambda row: row["z"] or 0.0)
     named = set(report["causes"][0]["effects"]) if report["verdict"] in _NAMING else set[str]()
     least = max((row["z"] or 0.0 for row in rows if row["effect"] in named), default=0.0)
     asked = [words(row["effect"]) for row in rows if row.get("opposite") and -(row["z"] or 0.0) > least]

@@ -57,10 +57,10 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         fitted = fitting.fit(problem, turned(problem, x, problem.compiled.by_cluster))
         if np.isfinite(fitted.log_posterior):
             fits.append(fitted)
-        values = sorted(
-            (f.log_posterior for f in fits), reverse=True
-        )  # three may agree on a lower one of two modes
-        if len(values) > _ENOUGH and values[0] - values[-1] < _SAME:
+        values = [f.log_posterior for f in fits]
+        if (
+            len(values) > _ENOUGH and max(values) - min(values) < _SAME
+        ):  # some may agree on a lower one of two modes
             break
     if not fits:
         raise broken(problem, [np.median(draws, axis=0), *draws[: starts - 1]])

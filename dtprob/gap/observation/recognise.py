@@ -14,9 +14,8 @@ from dtprob.errors import InputError
 from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, SAME, likelihood
 from dtprob.gap.observation.limited import TRUNCATED
 from dtprob.gap.observation.normal_scores import NORMAL_SCORES
+from dtprob.models.wrapping import unwrapped
 
-_WRAPPERS: Final = (dist.Independent, dist.ExpandedDistribution, dist.MaskedDistribution)
-"""What changes the shape or the weight of a distribution and not its density."""
 _IN_TURN: Final = "the first of all, the second of what the first leaves, and so on"
 _INSTEAD: Final = {
     **dict.fromkeys(
@@ -32,18 +31,6 @@ class _Found(NamedTuple):
 
     family: str
     parameters: Mapping[str, Any]
-
-
-def unwrapped(fn: Any) -> tuple[Any, Any]:
-    """A distribution without what changes its shape or its mask, and the mask; None where all counts."""
-    mask: Any = None
-    while isinstance(fn, _WRAPPERS):
-        if isinstance(fn, dist.MaskedDistribution):
-            own = jnp.asarray(fn._mask)  # noqa: SLF001  # pyright: ignore[reportPrivateUsage]
-            own = own.reshape(own.shape + (1,) * (len(fn.event_shape) if own.ndim else 0))
-            mask = own if mask is None else mask & own
-        fn = fn.base_dist
-    return fn, mask
 
 
 def recognised(fn: Any, value: Any, name: str) -> tuple[str, dict[str, jax.Array]]:

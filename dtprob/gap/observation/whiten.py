@@ -15,8 +15,9 @@ import jax
 import jax.numpy as jnp
 
 from dtprob.gap.observation.likelihoods import likelihood
-from dtprob.gap.observation.recognise import recognised, unwrapped
+from dtprob.gap.observation.recognise import recognised
 from dtprob.gap.observation.residuals import Parameters
+from dtprob.models.wrapping import unwrapped
 
 
 @dataclass(frozen=True)

@@ -132,13 +132,8 @@ def screen(
     smallest = np.concatenate([mean_p[0], tested.smallest])
     names = [e.name for e in (*means, *fields)]
     order = np.array([names.index(c.name) for c in candidates], int)
-    sided = [k for k, e in enumerate(means) if _is_half(e) and e.name not in placed]
-    below = any_of(stats.norm.cdf(mean_z[0, sided]), tests) <= settings.level / 2
-    opposite = {means[k].name for k, is_below in zip(sided, below, strict=True) if is_below}
-    alone = [k for k, e in enumerate(means) if len(sizes(e)) == 1 and e.name not in placed]
-    sure = any_of(mean_p[0, alone], tests) <= settings.level / 2
-    asked = {means[k].name: scores.asked(k) for k, is_sure in zip(alone, sure, strict=True) if is_sure}
-    beyond = {name: size for name, size in asked.items() if size > _FAR}
+    above, below = (any_of(p, tests) for p in (mean_p[0], stats.norm.cdf(mean_z[0])))
+    opposite, beyond = _excluded(scores, above, below, placed, settings)
     log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
     return Screening(
         names=tuple(c.name for c in candidates),
@@ -164,9 +159,23 @@ def _smallest(replicate_p: np.ndarray, *others: np.ndarray) -> np.ndarray:
     return replicate_p
 
 
-def _is_half(effect: Effect) -> bool:
-    """Whether an effect has one size, of which its prior excludes one side."""
-    return len(sizes(effect)) == 1 and is_one_sided(effect)
+def _excluded(
+    scores: Scores, above: np.ndarray, below: np.ndarray, placed: Mapping[str, Placed], settings: Settings
+) -> tuple[set[str], dict[str, float]]:
+    """Effects of one size that data ask for on the side that its prior excludes, and how far out others are, if far.
+
+    Args:
+        scores: of the mean effects.
+        above: family-wise p-values of the sizes that the priors allow.
+        below: the same of those on the other side.
+        placed: effects whose place was looked for, of which nothing is said.
+        settings: the level.
+    """
+    alone = [(k, e) for k, e in enumerate(scores.effects) if len(sizes(e)) == 1 and e.name not in placed]
+    level = settings.level / 2
+    opposite = {e.name for k, e in alone if is_one_sided(e) and below[k] <= level}
+    asked = {e.name: scores.asked(k) for k, e in alone if above[k] <= level}
+    return opposite, {name: size for name, size in asked.items() if size > _FAR}
 
 
 def _is_open(fields: np.ndarray, means: np.ndarray, tests: float, settings: Settings) -> bool:
