@@ -14,8 +14,6 @@ _EDGES: Final = 8
 
 _ENDLESS: Final = 1e100
 """Curvatures whose squares may still be multiplied are below."""
-_FLAT: Final = 1e-100
-"""Curvatures below tell nothing: at the end of a uniform prior they vanish, and a step along them may not be endless."""
 _SAFE: Final = 1e-5
 """Smallest diagonal of a Cholesky factor at which a scaled curvature is taken as it is."""
 
@@ -76,7 +74,7 @@ def positive(matrix: np.ndarray) -> np.ndarray:
     if matrix.shape[-1] == 0:
         return matrix
     symmetric = (matrix + np.swapaxes(matrix, -1, -2)) / 2
-    size = np.sqrt(np.maximum(np.abs(np.einsum("...ii->...i", symmetric)), _FLAT))
+    size = np.sqrt(np.maximum(np.abs(np.einsum("...ii->...i", symmetric)), 1e-300))
     outer = size[..., :, None] * size[..., None, :]
     scaled = symmetric / outer
     if _is_positive(scaled):
