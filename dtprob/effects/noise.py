@@ -168,16 +168,15 @@ def noise_imbalance(sites: Sites, _data: Data) -> list[Effect]:
         axis = f"{side}_antenna"
 
         def weigh(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], axis: str = axis) -> Any:
-            level = jnp.concatenate([jnp.zeros(1), p["log_power"]])
-            return value * jnp.exp(on_axis(level, axis, CHANNEL_AXES))
+            return value * jnp.exp(on_axis(p["log_power"], axis, CHANNEL_AXES))
 
         effects.append(
             Effect(
                 "noise_imbalance",
                 {"noise_power": weigh},
-                (normal("log_power", 0.3, "1", count - 1),),
+                (normal("log_power", 0.3, "1", count),),
                 instance=side,
-                physics=f"Log noise power of the {side} elements against that of the first.",
+                physics=f"Log noise power of the {side} elements against the recorded one.",
                 source="N_a exp(c_a).",
             )
         )

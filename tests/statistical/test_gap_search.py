@@ -74,6 +74,40 @@ def test_noise_that_differs_by_a_column_is_noticed():
     assert best.p_value < 1e-4
 
 
+def scattered(x, street, district, y=None):
+    """A constant level under noise of a known size, in streets of four districts."""
+    del street, district
+    level = numpyro.sample("level", dist.Normal(0.0, 3.0))
+    with numpyro.plate("row", len(x)):
+        deviation = numpyro.deterministic("deviation", 1.0 + 0.0 * x)
+        numpyro.sample("y", dist.Normal(level, deviation), obs=y)
+
+
+def apart(value, p, context):
+    """Districts against the first one."""
+    return value * jnp.exp(jnp.concatenate([jnp.zeros(1), p["c"]])[context["district"]])
+
+
+LOUDER = (
+    Effect(
+        "louder",
+        {"deviation": lambda value, p, _: value * jnp.exp(p["c"])},
+        (Parameter("c", dist.Normal(0.0, 0.3)),),
+    ),
+    Effect("apart", {"deviation": apart}, (Parameter("c", dist.Normal(0.0, 0.15).expand([3]).to_event(1)),)),
+)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_a_family_that_says_the_same_in_another_form_takes_nothing_back(seed):
+    """Four deviations by two effects or by the site: the likelihood is one, but the effects' priors are narrower."""
+    data = rows(seed, spread=lambda street: np.exp(np.array([0.5, 0.7, 0.9, 1.1]))[street % 4])
+    data |= {"district": data["street"] % 4}
+    problem, key = Problem(scattered, data, LOUDER, "street"), jax.random.key(seed)
+    end = search(problem, fit_base(problem, key), key, SETTINGS, print).steps[-1]
+    assert set(end.view.fitted.effects) == {"louder", "apart"}
+
+
 def test_nothing_is_found_where_there_is_nothing():
     """Four diagnoses at a level of 1%: one alarm has probability .04, two .0006."""
     assert sum(look(rows(10 + s), s)[0].view.alarmed(SETTINGS) for s in range(4)) <= 1

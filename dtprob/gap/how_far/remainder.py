@@ -8,7 +8,7 @@ cluster's own, or a spread, widens the prediction there. Both are judged on clus
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -112,11 +112,25 @@ def model_remainder(
     )
 
 
-def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) -> float:
-    """Log evidence of the fit with the one family of a site that has the most, less the price of having picked it.
+@dataclass(frozen=True)
+class Alone:
+    """The fit with one family of a site and no effect, in the problem in which the family is live.
 
-    Minus infinity where none is suspected. Families of which each cluster has its own weights are left out: they follow
-    anything.
+    Attributes:
+        problem: the model with the family as a field.
+        fitted: the fit.
+        weights: how many of the family's random weights the data determine.
+    """
+
+    problem: Problem
+    fitted: fitting.Fit
+    weights: float
+
+
+def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) -> Iterator[Alone]:
+    """Fits with one family of a site whose log evidence, less the price of having picked it, is more than the least.
+
+    Families of which each cluster has its own weights are left out: they follow anything.
 
     Args:
         view: the fit without any effect, and the families that are suspected there.
@@ -129,10 +143,13 @@ def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) ->
     apart = {(s.site, round(s.evidence, 3)): s for s in shared if size_of(problem, s) <= _WEIGHTS}
     named = _named(_site_by_site(list(apart.values()))[:_TRIED])
     if not named:
-        return -np.inf
+        return
     begun()
     wider, fitted = _wider(view, named)
-    return max(_fitted_with(wider, fitted, name).log_evidence - s.price for name, s in named.items())
+    for name, suspect in named.items():
+        one = _fitted_with(wider, fitted, name)
+        if one.log_evidence - suspect.price > least:
+            yield Alone(wider, one, shared_weights(wider, one, name))
 
 
 def _site_by_site(suspects: Sequence[Suspect]) -> list[Suspect]:

@@ -15,9 +15,10 @@ import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bound import bound
+from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.marginal_mode import faithful
 from dtprob.gap.fitting.refit import BETTER, at_null_except, refit, starting_points, without
-from dtprob.gap.how_far.remainder import alone
+from dtprob.gap.how_far.remainder import Alone, alone
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View, view
@@ -37,6 +38,8 @@ one family of a site has to be better than effects that stand in for it."""
 _FAR: Final = 8.0
 _FAR_SHARE: Final = 0.15
 """Nats, and share of what was gained, by which it has to be better than a single effect, real ones having other forms."""
+_ALIKE: Final = 0.5
+"""Parameters by which a family of a site is simpler than effects."""
 _MISSED: Final = 6.0
 """Times what first-order scores promise that a refit may gain."""
 _UNDERSTATED: Final = 0.15
@@ -115,14 +118,18 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
             ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
     bare = steps[0].view
-    if _stands_in(bare, ways[0][-1].view.fitted, base, field, say):
+    if _stands_in(bare, ways[0][-1].view, base, field, say):
         ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
 
 
-def _stands_in(bare: View, found: fitting.Fit, base: fitting.Fit, field: str | None, say: Say) -> bool:
-    """Whether one family of a site is better than what was found, by how much depends on what that can imitate."""
+def _stands_in(bare: View, end: View, base: fitting.Fit, field: str | None, say: Say) -> bool:
+    """Whether one family of a site is better than what was found, by how much depends on what that can imitate.
+
+    One that is no simpler has to explain more: of two forms of the same the effects' own stands, whatever their priors.
+    """
+    found = end.fitted
     if not found.effects:
         return False
     worth = credit(bare.problem, found, base)
@@ -130,7 +137,17 @@ def _stands_in(bare: View, found: fitting.Fit, base: fitting.Fit, field: str | N
     least = worth + (_NEARLY if may_imitate else max(_FAR, _FAR_SHARE * (worth - base.log_evidence)))
     verb = "stands" if len(found.effects) == 1 else "stand"
     doing = f"looking whether {' and '.join(found.effects)} {verb} in for what varies more simply at a site"
-    return alone(bare, least, lambda: say(doing)) > least
+    parameters = {e.name: e.dimension for e in bare.problem.effects}
+    fewest = sum(parameters[name] for name in found.effects) - _ALIKE
+    return any(
+        one.weights < fewest or _likelihood(one) > _likelihood(end) + _NEARLY
+        for one in alone(bare, least, lambda: say(doing))
+    )
+
+
+def _likelihood(at: View | Alone) -> float:
+    """Log likelihood of all clusters at a fit."""
+    return float(marginal(at.problem, at.fitted).sum())
 
 
 def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
