@@ -15,13 +15,12 @@ import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bound import bound
-from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.marginal_mode import faithful
 from dtprob.gap.fitting.refit import BETTER, at_null_except, refit, starting_points, without
-from dtprob.gap.how_far.remainder import Alone, alone
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View, view
+from dtprob.gap.which.stand_in import stands_in
 from dtprob.gap.which.trials import Say, Start, Trials, best, credit, tried
 
 _RETURNS: Final = 3
@@ -33,13 +32,7 @@ _REVISED: Final = 5
 _WITHIN: Final = 0.25
 """Share of what another way gained by which one may fall short of it for its choices to be looked at again."""
 _NEARLY: Final = 3.0
-"""Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect; by which
-one family of a site has to be better than effects that stand in for it."""
-_FAR: Final = 8.0
-_FAR_SHARE: Final = 0.15
-"""Nats, and share of what was gained, by which it has to be better than a single effect, real ones having other forms."""
-_ALIKE: Final = 0.5
-"""Parameters by which a family of a site is simpler than effects."""
+"""Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect."""
 _MISSED: Final = 6.0
 """Times what first-order scores promise that a refit may gain."""
 _UNDERSTATED: Final = 0.15
@@ -118,36 +111,10 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
             ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
     bare = steps[0].view
-    if _stands_in(bare, ways[0][-1].view, base, field, say):
+    if stands_in(bare, ways[0][-1].view, base, field, say):
         ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
-
-
-def _stands_in(bare: View, end: View, base: fitting.Fit, field: str | None, say: Say) -> bool:
-    """Whether one family of a site is better than what was found, by how much depends on what that can imitate.
-
-    One that is no simpler has to explain more: of two forms of the same the effects' own stands, whatever their priors.
-    """
-    found = end.fitted
-    if not found.effects:
-        return False
-    worth = credit(bare.problem, found, base)
-    may_imitate = len(found.effects) > 1 or found.effects == (field,)
-    least = worth + (_NEARLY if may_imitate else max(_FAR, _FAR_SHARE * (worth - base.log_evidence)))
-    verb = "stands" if len(found.effects) == 1 else "stand"
-    doing = f"looking whether {' and '.join(found.effects)} {verb} in for what varies more simply at a site"
-    parameters = {e.name: e.dimension for e in bare.problem.effects}
-    fewest = sum(parameters[name] for name in found.effects) - _ALIKE
-    return any(
-        one.weights < fewest or _likelihood(one) > _likelihood(end) + _NEARLY
-        for one in alone(bare, least, lambda: say(doing))
-    )
-
-
-def _likelihood(at: View | Alone) -> float:
-    """Log likelihood of all clusters at a fit."""
-    return float(marginal(at.problem, at.fitted).sum())
 
 
 def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
