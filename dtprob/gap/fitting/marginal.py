@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Final
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
@@ -24,6 +25,8 @@ _SLOW: Final = 2
 """Steps by which the curvatures of Gauss and Newton should have arrived."""
 _HOLDS: Final = 0.25
 """Share of the last step's promise below which the next one's shows that kept curvatures still hold."""
+_ROUNDED: Final = 8.0
+"""Last digits of a log density that say nothing: near the mode steps gain less, and gradients lead."""
 _GAIN: Final = 0.1
 """Nats by which a fit has to be better to be another one."""
 
@@ -123,12 +126,13 @@ def own_mode(
     """
     x, terms, damping = x.copy(), cluster_terms(problem, active, x), np.full(problem.n_cluster, _DAMPING)
     own, promised, is_exact = active.own, np.inf, near is not None
+    rounding = _ROUNDED * float(jnp.finfo(jnp.result_type(float)).eps)
     system = system_at(problem, own, x) if near is None else rescored(problem, own, x, near)
     for number in range(steps):
         step = local_step(system, damping)
         trial = moved(problem, own, x, step)
         new = cluster_terms(problem, active, trial)
-        better = new > terms
+        better = new > terms - rounding * np.abs(terms)
         x[active.local_index[better]] = trial[active.local_index[better]]
         terms = np.where(better, new, terms)
         damping = np.where(better, damping / 4, damping * 4)

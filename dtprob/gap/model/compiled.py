@@ -13,7 +13,7 @@ import numpy as np
 
 from dtprob.gap.model.bend import bending
 from dtprob.gap.model.misses import Miss, misses
-from dtprob.gap.model.quick import quick_jit
+from dtprob.gap.model.quick import Adaptive, quick_jit
 from dtprob.gap.model.rows import stacked
 from dtprob.gap.model.running import Arrays, Outcome, Runner
 from dtprob.gap.observation import whiten
@@ -100,7 +100,7 @@ class Compiled:
     def slope(self) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
         """(x, weights (cluster,)) -> gradient (dimension,) of the clusters' weighted log likelihoods."""
 
-        @quick_jit
+        @Adaptive
         def slope(x: Any, weights: Any, arrays: Arrays) -> jax.Array:
             def total(y: Any) -> jax.Array:
                 likelihood = self.terms(y, arrays).likelihood
@@ -118,18 +118,24 @@ class Compiled:
         """
 
         @jax.jit
-        def curvature(x: Any, weights: Any, basis: jax.Array, arrays: Arrays) -> jax.Array:
+        def curvature(x: Any, weights: Any, basis: jax.Array, count: Any, arrays: Arrays) -> jax.Array:
             def total(y: Any) -> jax.Array:
                 found = self.terms(y, arrays)
                 own = jnp.where(weights > 0, found.likelihood + found.local, 0.0)
                 return found.prior + jnp.sum(weights * own)
 
-            return -jax.lax.map(lambda direction: jax.jvp(jax.grad(total), (x,), (direction,))[1], basis)
+            def put(i: Any, into: jax.Array) -> jax.Array:
+                return into.at[i].set(-jax.jvp(jax.grad(total), (x,), (basis[i],))[1])
+
+            return jax.lax.fori_loop(0, count, put, jnp.zeros_like(basis))
 
         def chunked(x: np.ndarray, weights: np.ndarray, basis: np.ndarray) -> np.ndarray:
             given = jnp.asarray(x), jnp.asarray(weights, float)
-            parts = [np.asarray(curvature(*given, chunk, self.arrays)) for chunk in _chunks(basis)]
-            return np.concatenate(parts)[: len(basis)]
+            parts = [
+                curvature(*given, chunk, min(len(basis) - CHUNK * i, CHUNK), self.arrays)
+                for i, chunk in enumerate(_chunks(basis))
+            ]
+            return np.concatenate([np.asarray(part) for part in parts])[: len(basis)]
 
         return chunked
 

@@ -109,7 +109,8 @@ def ultra_wideband_profile(
     mean = site("tap_power", amplitude[:, None] ** 2 * room + noise[:, None])
     form: Any = numpyro.sample("shape", dist.LogNormal(0.0, 0.5))
     with numpyro.plate("link", shape[0], dim=-2), numpyro.plate("tap", shape[1], dim=-1):
-        numpyro.sample("power", dist.Gamma(form, form / mean), obs=power)
+        rate = jnp.exp(jnp.log(form) - jnp.log(mean))  # whose derivatives do not overflow at some picowatts
+        numpyro.sample("power", dist.Gamma(form, rate), obs=power)
     return mean
 
 
@@ -176,12 +177,15 @@ def _over_taps(
 def _unknown_tail(
     paths: PathSet, delay: jax.Array, late: jax.Array, tap_delay: jax.Array
 ) -> Float[Array, "link tap"]:
-    """Waves that are not resolved: exponential behind the first path, its rise one tap long."""
+    """Waves that are not resolved: exponential behind the first path, its rise one tap long and flat at its foot.
+
+    With a corner there the density had one in each link's delay for each tap, and modes sat in these.
+    """
     share: Any = numpyro.sample("tail_share", dist.LogNormal(np.log(0.1), 1.5))
     decay: Any = numpyro.sample("tail_decay", dist.LogNormal(np.log(10e-9), 0.7))
     first = jnp.min(jnp.where(paths.mask, delay, jnp.inf), axis=1)
     free = (1.0 / (4.0 * jnp.pi * paths.frequency * first)) ** 2
     step = tap_delay[1] - tap_delay[0]
     behind = jnp.maximum(tap_delay - (first + late)[:, None], 0.0)
-    form = jnp.exp(-behind / decay) * -jnp.expm1(-behind / step) * (step / decay)
+    form = jnp.exp(-behind / decay) * -jnp.expm1(-((behind / step) ** 2)) * (step / decay)
     return share * free[:, None] * form
