@@ -26,7 +26,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
-from dtprob.gap.where.site_finding import most_left
+from dtprob.gap.where.site_finding import likely_left, most_left
 from dtprob.gap.which.classes import credible
 from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.search import search
@@ -135,7 +135,9 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
         held_after = closed.judged(last.problem, folds)
     wrong = [s for s in last.location.sites if s.p_value <= settings.level / 2]
     asked_for = _asked_for(last, settings)
-    remains, left = bool(wrong), max([most_left(wrong), *map(last.screening.promise_of, asked_for)])
+    remains = bool(wrong)
+    by_sites = most_left(wrong) if remains else likely_left(last.location.sites)
+    left = max([by_sites, *map(last.screening.promise_of, asked_for)])
     floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     held = held_before, held_after
     fraction = closed.closed_fraction(*held, floor, keys[2]) if last.fitted.effects else None

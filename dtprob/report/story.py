@@ -8,6 +8,7 @@ from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import UNSEEN, Cause, Detectable, Report, Site, is_quiet
 from dtprob.report.names import (
+    LEVEL,
     aliases,
     block,
     capital,
@@ -196,6 +197,8 @@ def _listed(report: Report) -> Story:
         rest = "What is left is not chance, but small beside the cause."
     elif called_for:
         rest = f"The data call for one more effect, {together(called_for)}, which is small beside the cause."
+    elif report["unlisted"]["p_value"] < LEVEL:
+        rest = "What is left may be more than chance, which the share allows for."
     else:
         rest = "What is left is no more than chance."
     return Story(

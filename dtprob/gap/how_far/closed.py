@@ -201,7 +201,7 @@ def floor(problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: f
         problem: in which the causes are live.
         full: the fit with the causes to all clusters.
         after: held-out results with the causes.
-        remaining_gain: nats that moving any one site freely would still gain, 0 where nothing is significant.
+        remaining_gain: nats that moving any one site freely would still gain, as far as it is likely that one is wrong.
         n_folds: K.
     """
     size = sum(e.dimension for e in problem.effects if e.name in full.effects)

@@ -33,7 +33,7 @@ from dtprob.gap.where.gains import gains
 from dtprob.gap.where.moments import further_moments
 from dtprob.gap.where.quantities import Quantity, groups, quantity
 from dtprob.gap.where.site_finding import SURE, SiteFinding, rank, shadows_last
-from dtprob.gap.where.suspects import Suspect, suspects
+from dtprob.gap.where.suspects import Suspect, plainest, suspects
 
 _ALL_SPREAD: Final = 0.999
 """Share of what a site moves that lies in spreads where it moves nothing else."""
@@ -253,7 +253,7 @@ def _finding(
     tests: Sequence[FamilyTest],
     smallest: np.ndarray,
 ) -> SiteFinding:
-    """The family of a site with the smallest p-value, with the gain along its steepest direction."""
+    """The smallest p-value of a site's families, with the gain along that family's steepest direction."""
     best = min(tests, key=lambda test: (test.p_value, -_each(test)))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
@@ -263,4 +263,5 @@ def _finding(
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
     score = max(map(_each, tests))
-    return SiteFinding(site.name, best.label, p_value, net, spreads=spreads, score=score)
+    named = plainest(tests).label if p_value <= SURE else best.label
+    return SiteFinding(site.name, named, p_value, net, spreads=spreads, score=score)

@@ -64,6 +64,18 @@ def most_left(found: Iterable[SiteFinding]) -> float:
     return max(most_gained(sites), max(told, default=0.0))
 
 
+def likely_left(found: Iterable[SiteFinding]) -> float:
+    """Nats that are left where no site is surely wrong: the gain at one, for the share of doubt that its p-value leaves.
+
+    That something is wrong is 1 / (-e p log p) times as likely as the p-value says at most (Sellke, Bayarri and Berger,
+    Am. Stat. 55 (2001) 62): above 1 / e nothing speaks for it.
+    """
+    sites = (one for one in found if one.gain is not None and 0 < one.p_value < math.exp(-1))
+    return max(
+        ((1 + math.e * one.p_value * math.log(one.p_value)) * (one.gain or 0.0) for one in sites), default=0.0
+    )
+
+
 def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFinding]:
     """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong.
 

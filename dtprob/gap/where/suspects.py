@@ -15,6 +15,8 @@ from dtprob.gap.which.fields import common_spread, spread_terms
 _MOST_SUSPECTS: Final = 12
 _MOST_WEIGHTS: Final = 4096
 """Suspects of a site that are kept, and weights that one of them may have."""
+_NEARLY: Final = 0.8
+"""Share of the surest family's log p-value that another one has at least where it may be named instead."""
 
 
 @dataclass(frozen=True)
@@ -51,6 +53,28 @@ def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
     found = [_suspect(site, test, choice) for test in whole]
     found += [_suspect(site, narrow, choice, band) for test in whole for narrow, band in _narrowed(test)]
     return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
+
+
+def plainest(tests: Sequence[FamilyTest]) -> FamilyTest:
+    """Of a site's families nearly as sure as the surest, and of its kind, the one with the most evidence.
+
+    The surest may be one of curves that overlap, which are tested together: what varies along another column shows in many.
+    """
+    surest = min(tests, key=lambda test: test.p_value)
+    most = _NEARLY * np.log(surest.p_value)
+    alike = [t for t in tests if t.family.kind == surest.family.kind and np.log(t.p_value) <= most]
+    return max(alike, key=_evidence) if len(alike) > 1 else surest
+
+
+def _evidence(test: FamilyTest) -> float:
+    """Log Bayes factor of random weights of a family, of the best place alone where its curves overlap."""
+    curves, size = test.family.pattern.curves, len(test.variance)
+    if curves is None or not curves.overlaps:
+        return common_spread(test.first[0], test.variance)[1]
+    each = size // len(curves.places)
+    places = [slice(start, start + each) for start in range(0, size, each)]
+    best = max(common_spread(test.first[0][place], test.variance[place])[1] for place in places)
+    return best - float(np.log(len(places)))
 
 
 def _overlaps(pattern: Pattern) -> bool:

@@ -118,6 +118,40 @@ def test_taps_spread_as_the_shape_says_about_a_mean_that_noise_raises(paths):
     np.testing.assert_allclose(law.variance, mean**2 / 2.0, rtol=1e-6)
 
 
+def test_second_derivatives_hold_at_a_picowatt_in_single_precision(paths):
+    """A rate of 1e13 per watt, whose second derivative by the power is beyond what single precision holds."""
+
+    def density(level):
+        given = {"floor": jnp.asarray(1e-3), "shape": jnp.asarray(2.0)}
+        trace = traced(paths, **given, transmitted_power=TRANSMITTED * level)
+        law = trace["power"]["fn"]
+        return jnp.sum(law.log_prob(jnp.full(law.mean.shape, 1e-13)))
+
+    with jax.enable_x64(False):
+        found = jax.grad(jax.grad(density))(jnp.asarray(1.0))
+    assert jnp.isfinite(found)
+
+
+def test_the_density_has_no_corner_where_the_tail_begins(paths):
+    """A tap that the tail's foot moves over is as steep on both sides."""
+    first = np.where(np.asarray(paths.mask), np.asarray(paths.delay), np.inf).min(axis=1)[0]
+    late = (TAPS[20] - first) / 1e-9 / 0.6  # the foot of the first link's tail lies at a tap
+    shares = {
+        "tail_share": jnp.asarray(0.2),
+        "tail_decay": jnp.asarray(8e-9),
+        "ranging_offset": jnp.asarray(-2.0),
+    }
+
+    def tail(moved):
+        delay = jnp.zeros(5).at[0].set(late + moved)
+        return at(paths, **shares, link_delay=delay)["tail"][0, 20]
+
+    ahead, behind = (tail(side * 1e-4) for side in (-1, 1))
+    top = at(paths, **shares, link_delay=jnp.zeros(5).at[0].set(late))["tail"][0].max()
+    assert behind == 0.0
+    assert 0.0 < ahead < 1e-6 * top  # quadratic: a corner would leave 1e-4 of it
+
+
 def test_unknown_materials_change_the_powers_of_their_paths(paths):
     known, unknown = at(paths), at(paths, {"materials": "shared"})
     assert not np.allclose(unknown["permittivity"], known["permittivity"], atol=0.0)

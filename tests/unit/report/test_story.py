@@ -242,6 +242,8 @@ def test_what_is_called_for_beside_the_cause_is_no_chance() -> None:
     assert "What is left is no more than chance." in tell(_report()).meaning
     more = {**_report(), "unlisted": {"p_value": 0.5, "sites": [], "called_for": ["slow_drift"]}}
     assert "The data call for one more effect, slow drift, which is small" in tell(more).meaning
+    doubtful = {**_report(), "unlisted": {"p_value": 0.02, "sites": [], "called_for": []}}
+    assert "What is left may be more than chance" in tell(doubtful).meaning
 
 
 def test_next_step_says_what_is_saved_and_what_does_not_help() -> None:

@@ -23,7 +23,7 @@ from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import family_test
 from dtprob.gap.where.locate import locate
 from dtprob.gap.where.moments import _delayed, further_moments, moment
-from dtprob.gap.where.site_finding import SiteFinding, most_left
+from dtprob.gap.where.site_finding import SiteFinding, likely_left, most_left
 from dtprob.models.declaration import model
 
 LINKS, TIMES, OUTPUTS = 30, 20, 3
@@ -187,6 +187,14 @@ def test_what_goes_together_leaves_what_its_chance_tells_unless_it_is_a_shadow()
     assert most_left([]) == 0.0
     small = replace(values, family="spread, by group", p_value=1e-40, gain=12.0)
     assert most_left([small]) == pytest.approx(40 * np.log(10))
+
+
+@pytest.mark.parametrize(("p", "share"), [(1e-9, 1.0), (0.01, 0.875), (0.1, 0.374), (0.4, 0.0), (1.0, 0.0)])
+def test_what_is_not_surely_wrong_leaves_its_gain_as_far_as_it_is_likely_to_be_wrong(p, share):
+    found = SiteFinding("y", "additive, along time", p, 12.0)
+    assert likely_left([found]) == pytest.approx(12.0 * share, abs=0.02)
+    assert likely_left([found, replace(found, gain=None)]) == likely_left([found])
+    assert likely_left([]) == 0.0
 
 
 def test_one_far_row_of_many_is_no_tail():

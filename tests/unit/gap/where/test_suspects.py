@@ -1,14 +1,15 @@
 """What a wrong site may vary like: ripples narrowed to the half waves that bring the evidence."""
 
+import dataclasses
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from dtprob.gap.where.curves import curves
+from dtprob.gap.where.curves import Curves, curves
 from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import FamilyTest
-from dtprob.gap.where.suspects import suspects
+from dtprob.gap.where.suspects import plainest, suspects
 
 N_ROW = 240
 RIPPLE = "ripple in row, 33 to 64 half waves"
@@ -49,3 +50,19 @@ def test_a_band_of_one_half_wave_is_left_as_it_is(ripples):
     one = family_of(ripples.band(0, 1))
     found = suspects(SITE, [FamilyTest(one, 0.0, np.ones(9), np.full((9, 1), 5.0), np.ones(1))])
     assert [s.family for s in found] == [one]
+
+
+def test_what_varies_along_a_column_is_not_named_by_one_of_many_places_that_show_it(ripples):
+    """Eight places that overlap are all out by 4, one cosine along a column by 10; together the places are the surest."""
+    places = Curves("near a place", np.eye(8), overlaps=True, places=tuple(f"place {i}" for i in range(8)))
+    scores = np.random.default_rng(1).normal(size=(9, 8))
+    scores[0] = 4.0
+    near = FamilyTest(family_of(places), 1e-14, np.ones(9), scores, np.ones(8))
+    wave = FamilyTest(family_of(ripples.band(0, 1)), 1e-13, np.ones(9), np.full((9, 1), 10.0), np.ones(1))
+    assert plainest([near, wave]) is wave
+    assert plainest([near, wave._replace(p_value=1e-6)]) is near  # far less sure
+    alone = scores.copy()
+    alone[0] = [0, 0, 0, 12.0, 0, 0, 0, 0]
+    assert plainest([near._replace(first=alone), wave]).label == "additive, place 3"
+    other = wave._replace(family=dataclasses.replace(wave.family, kind="spread"))
+    assert plainest([near, other]) is near
