@@ -192,12 +192,12 @@ def _seen(detectable: list[Detectable]) -> str:
 
 def _listed(report: Report) -> Story:
     cause = report["causes"][0]
-    called_for = report["unlisted"].get("called_for", [])
+    called_for, p_value = report["unlisted"].get("called_for", []), report["unlisted"]["p_value"]
     if report["unlisted"]["sites"]:
         rest = "What is left is not chance, but small beside the cause."
     elif called_for:
         rest = f"The data call for one more effect, {together(called_for)}, which is small beside the cause."
-    elif report["unlisted"]["p_value"] < LEVEL:
+    elif p_value is not None and p_value < LEVEL:
         rest = "What is left may be more than chance, which the share allows for."
     else:
         rest = "What is left is no more than chance."
