@@ -91,7 +91,7 @@ SITES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
             ("regional_bias", "scale_bias", "stale_map", "saturation", "swapped_segments", "periodic_bias"),
             ("predicted_label",),
         ),
-        "label_noise": ("label_deviation",),
+        "label_noise": ("label_deviation", "y"),
         "autocorrelated_errors": ("predicted_label", "y"),
     },
     "custom": {
