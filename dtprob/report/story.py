@@ -81,7 +81,9 @@ def next_step(report: Report) -> str | None:
     each = " each" * any(isinstance(value, list | tuple) and len(value) > 1 for value in where.values())
     many = f" {times} times{each}" if times > 1 else ""
     again = "" if offered else " again"
-    return f"Measure {place}{again}{many}: there the explanations differ most.{_saved(plan)}"
+    alone = [] in plan.get("split", [])
+    why = "there it would show most" if alone else "there the explanations differ most"
+    return f"Measure {place}{again}{many}: {why}.{_saved(plan)}"
 
 
 def _places(value: Any) -> str:

@@ -36,7 +36,9 @@ _AGAIN: Final = "again"
 def next_measurement(
     evidence: Evidence, causes: Sequence[Cause], designs: Mapping[str, Data]
 ) -> dict[str, Any] | None:
-    """What to measure so that the explanations that are left can be told apart; None where one alone is left.
+    """What to measure so that the explanations that are left can be told apart; None where nothing was found.
+
+    Where one alone is left, which the data do not confirm, its rival is the twin as it is.
 
     Args:
         evidence: of the diagnosis.
@@ -48,11 +50,13 @@ def next_measurement(
         For report.json: the classes, the recommended designs with their repeats and what they bring, whether they are all
         that is there, as nothing less decides for less, what repeating that costs, and the best single designs in order.
     """
-    if not causes or len(causes[0].alias_class) < 2:
+    if not causes:
         return None
-    found = evidence.explanations
-    here = evidence.last.problem.with_live([name for names in causes[0].alias_class for name in names])
-    fits = [_moved(here, found[names]) for names in causes[0].alias_class]
+    bare = evidence.steps[0].view
+    found = {**evidence.explanations, (): Start(bare.problem, bare.fitted)}
+    rivals = causes[0].alias_class if len(causes[0].alias_class) > 1 else (*causes[0].alias_class, ())
+    here = evidence.last.problem.with_live([name for names in rivals for name in names])
+    fits = [_moved(here, found[names]) for names in rivals]
     again = designs_of(here, here, fits, _AGAIN)
     candidates = list(again)
     for name, data in designs.items():
@@ -61,7 +65,7 @@ def next_measurement(
     whole = told if told is not None and told.resolves else None
     best = cheapest(candidates, whole)
     return {
-        "split": [list(names) for names in causes[0].alias_class],
+        "split": [list(names) for names in rivals],
         "design": dict(best.where),
         "repeats": best.repeats,
         "gain_nats": best.nats,

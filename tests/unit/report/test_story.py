@@ -253,6 +253,8 @@ def test_next_step_says_what_is_saved_and_what_does_not_help() -> None:
     assert said is not None
     assert said.startswith("Measure link 3 of the design roof sites: there the explanations differ most.")
     assert said.endswith("Everything again would cost 12 times as much.")
+    alone = {"next_measurement": {**plan, "split": [["slow_drift"], []]}}
+    assert str(next_step(alone)) == "Measure link 3 of the design roof sites: there it would show most."
     report = {"next_measurement": {**plan, "cost_of_all_again": None}}
     assert str(next_step(report)).endswith("Measuring everything again would not decide.")
     assert "verything" not in str(

@@ -239,6 +239,27 @@ def test_a_diagnosis_recommends_what_splits_its_class():
     assert after.causes[0].effects == ("bend_2",)
 
 
+def test_signs_of_an_effect_that_the_data_do_not_confirm_are_decided_against_the_twin_as_it_is():
+    """Of a parabola the ends and the middle tell most; measured as often as it is said they confirm it."""
+    x = np.linspace(0.3, 2.0, 40)
+
+    def curve(x, seed):
+        noise = np.random.default_rng(seed).standard_normal(len(x))
+        return {"x": jnp.asarray(x), "y": jnp.asarray(0.5 + x + 0.4 * x**2 + SIGMA * noise)}
+
+    options = {"key": jax.random.key(0), "engine": Laplace(draws=100), "settings": FAST}
+    before = curve(x, 0)
+    found = diagnose(line, before, EFFECTS[:1], **options)
+    assert (found.verdict, found.causes[0].effects) == ("UNDETERMINED", ("bend_2",))
+    plan = found.sections["next_measurement"]
+    assert plan["split"] == [["bend_2"], []]
+    assert plan["design"]["row"] == [0, 19, 39]
+    assert plan["resolves"]
+    new = curve(np.repeat(x[plan["design"]["row"]], plan["repeats"]), 4)
+    both = {name: jnp.concatenate([before[name], new[name]]) for name in before}
+    assert diagnose(line, both, EFFECTS[:1], **options).verdict == "LISTED"
+
+
 def test_everything_again_is_a_plan_where_no_few_places_cost_less():
     """Unknown levels of 40 sites hide the same difference at each: a few sites never tell, all do at once."""
     levels = np.eye(40)
