@@ -16,7 +16,8 @@ _MOST_SUSPECTS: Final = 12
 _MOST_WEIGHTS: Final = 4096
 """Suspects of a site that are kept, and weights that one of them may have."""
 _NEARLY: Final = 0.8
-"""Share of the surest family's log p-value that another one has at least where it may be named instead."""
+_FEW: Final = 16
+"""Share of the surest family's log p-value that another one has at least where it may be named instead, and its weights."""
 
 
 @dataclass(frozen=True)
@@ -56,20 +57,23 @@ def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
 
 
 def plainest(tests: Sequence[FamilyTest]) -> FamilyTest:
-    """Of a site's families nearly as sure as the surest, and of its kind, the one with the most evidence.
+    """The surest of a site's families; of curves that overlap, or of few weights and nearly as sure, the most evident.
 
-    The surest may be one of curves that overlap, which are tested together: what varies along another column shows in many.
+    Curves that overlap are tested together: what varies along another column shows in many of them.
     """
     surest = min(tests, key=lambda test: test.p_value)
+    if not _overlaps(surest.family.pattern):
+        return surest
     most = _NEARLY * np.log(surest.p_value)
     alike = [t for t in tests if t.family.kind == surest.family.kind and np.log(t.p_value) <= most]
-    return max(alike, key=_evidence) if len(alike) > 1 else surest
+    few = [t for t in alike if len(t.variance) <= _FEW or _overlaps(t.family.pattern)]
+    return max(few, key=_evidence)
 
 
 def _evidence(test: FamilyTest) -> float:
     """Log Bayes factor of random weights of a family, of the best place alone where its curves overlap."""
     curves, size = test.family.pattern.curves, len(test.variance)
-    if curves is None or not curves.overlaps:
+    if curves is None or not _overlaps(test.family.pattern):
         return common_spread(test.first[0], test.variance)[1]
     each = size // len(curves.places)
     places = [slice(start, start + each) for start in range(0, size, each)]
