@@ -275,15 +275,28 @@ def test_a_family_that_stands_alone_pays_for_having_been_picked():
     def found(*suspects, least=0.0):
         location = SimpleNamespace(suspects=suspects)
         view = SimpleNamespace(problem=problem, fitted=fitted, location=location)
-        return alone(view, fitted.log_evidence + least)
+        return [one.fitted.log_evidence for one in alone(view, fitted.log_evidence + least)]
 
-    free = found(place)
-    assert free > found(street) + 20.0
-    assert found(place, street) == pytest.approx(free, abs=1e-6)
-    assert found(replace(place, price=7.0), street) == pytest.approx(free - 7.0, abs=1e-6)
-    assert found() == -np.inf
-    assert found(place, least=110.0) == pytest.approx(free, abs=1e-6)
-    assert found(place, least=130.0) == -np.inf  # it does not promise half of that
+    (free,) = found(place)
+    assert found(street, least=-np.inf) == []  # of which each cluster has its own
+    assert found(place, street, least=-np.inf) == pytest.approx([free], abs=1e-6)
+    gained = free - fitted.log_evidence
+    assert found(place, least=gained - 6.0) == pytest.approx([free], abs=1e-6)
+    assert found(replace(place, price=7.0), least=gained - 6.0) == []
+    assert found() == []
+    assert found(place, least=gained + 1.0) == []
+    assert (
+        found(replace(place, evidence=0.4 * gained), least=gained - 1.0) == []
+    )  # it does not promise half of that
+
+
+def test_what_stands_alone_counts_the_weights_that_the_data_determine():
+    problem, fitted, _, _ = prepared(rows(1, wave))
+    place = suspect(problem, "along place", evidence=60.0)
+    view = SimpleNamespace(problem=problem, fitted=fitted, location=SimpleNamespace(suspects=[place]))
+    (one,) = alone(view, fitted.log_evidence)
+    size = place.family.pattern.curves.values.shape[0]
+    assert 1.0 < one.weights <= size
 
 
 def test_predictions_of_a_right_model_are_calibrated():
