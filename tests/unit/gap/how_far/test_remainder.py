@@ -281,12 +281,13 @@ def test_a_family_that_stands_alone_pays_for_having_been_picked():
     assert found(street, least=-np.inf) == []  # of which each cluster has its own
     assert found(place, street, least=-np.inf) == pytest.approx([free], abs=1e-6)
     gained = free - fitted.log_evidence
+    place = replace(place, evidence=gained)
     assert found(place, least=gained - 6.0) == pytest.approx([free], abs=1e-6)
     assert found(replace(place, price=7.0), least=gained - 6.0) == []
-    assert found() == []
     assert found(place, least=gained + 1.0) == []
+    assert found() == []
     assert (
-        found(replace(place, evidence=0.4 * gained), least=gained - 1.0) == []
+        found(replace(place, evidence=0.4 * gained), least=gained - 6.0) == []
     )  # it does not promise half of that
 
 
