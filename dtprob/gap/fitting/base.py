@@ -58,9 +58,8 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         if np.isfinite(fitted.log_posterior):
             fits.append(fitted)
         values = [f.log_posterior for f in fits]
-        if (
-            len(values) > _ENOUGH and max(values) - min(values) < _SAME
-        ):  # some may agree on a lower one of two modes
+        # all of them: some may agree on a lower one of two modes
+        if len(values) > _ENOUGH and max(values) - min(values) < _SAME:
             break
     if not fits:
         raise broken(problem, [np.median(draws, axis=0), *draws[: starts - 1]])

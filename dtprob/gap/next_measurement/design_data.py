@@ -52,9 +52,9 @@ def next_measurement(
     """
     if not causes:
         return None
-    bare = evidence.steps[0].view
-    found = {**evidence.explanations, (): Start(bare.problem, bare.fitted)}
-    rivals = causes[0].alias_class if len(causes[0].alias_class) > 1 else (*causes[0].alias_class, ())
+    found = {**evidence.explanations, (): Start(evidence.problem, evidence.base)}
+    alike = causes[0].alias_class
+    rivals = alike if len(alike) > 1 else (*alike, ())
     here = evidence.last.problem.with_live([name for names in rivals for name in names])
     fits = [_moved(here, found[names]) for names in rivals]
     again = designs_of(here, here, fits, _AGAIN)

@@ -263,5 +263,5 @@ def _finding(
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
     score = max(map(_each, tests))
-    named = plainest(tests).label if p_value <= SURE else best.label
+    named = plainest(best, tests).label if p_value <= SURE else best.label
     return SiteFinding(site.name, named, p_value, net, spreads=spreads, score=score)

@@ -70,10 +70,9 @@ def likely_left(found: Iterable[SiteFinding]) -> float:
     That something is wrong is 1 / (-e p log p) times as likely as the p-value says at most (Sellke, Bayarri and Berger,
     Am. Stat. 55 (2001) 62): above 1 / e nothing speaks for it.
     """
-    sites = (one for one in found if one.gain is not None and 0 < one.p_value < math.exp(-1))
-    return max(
-        ((1 + math.e * one.p_value * math.log(one.p_value)) * (one.gain or 0.0) for one in sites), default=0.0
-    )
+    told = ((one.p_value, one.gain) for one in found if one.gain is not None)
+    likely = ((1 + math.e * p * math.log(p)) * gain for p, gain in told if 0 < p < math.exp(-1))
+    return max(likely, default=0.0)
 
 
 def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFinding]:

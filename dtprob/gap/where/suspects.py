@@ -56,12 +56,11 @@ def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
     return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
 
 
-def plainest(tests: Sequence[FamilyTest]) -> FamilyTest:
+def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
     """The surest of a site's families; of curves that overlap, or of few weights and nearly as sure, the most evident.
 
     Curves that overlap are tested together: what varies along another column shows in many of them.
     """
-    surest = min(tests, key=lambda test: test.p_value)
     if not _overlaps(surest.family.pattern):
         return surest
     most = _NEARLY * np.log(surest.p_value)
@@ -73,7 +72,7 @@ def plainest(tests: Sequence[FamilyTest]) -> FamilyTest:
 def _evidence(test: FamilyTest) -> float:
     """Log Bayes factor of random weights of a family, of the best place alone where its curves overlap."""
     curves, size = test.family.pattern.curves, len(test.variance)
-    if curves is None or not _overlaps(test.family.pattern):
+    if curves is None or not curves.overlaps:
         return common_spread(test.first[0], test.variance)[1]
     each = size // len(curves.places)
     places = [slice(start, start + each) for start in range(0, size, each)]

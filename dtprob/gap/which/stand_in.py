@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Final
 
 import numpy as np
@@ -43,11 +44,11 @@ def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> 
     least = worth + (_BETTER if may_imitate else max(_FAR, _FAR_SHARE * (worth - base.log_evidence)))
     verb = "stands" if len(found.effects) == 1 else "stand"
     doing = f"looking whether {' and '.join(found.effects)} {verb} in for what varies more simply at a site"
-    fewest = (
-        sum(_freedom(end, effect) for effect in end.problem.effects if effect.name in found.effects) - _ALIKE
-    )
+    effects = (effect for effect in end.problem.effects if effect.name in found.effects)
+    fewest = sum(_freedom(end, effect) for effect in effects) - _ALIKE
+    reached = cache(lambda: _likelihood(end))
     return any(
-        one.weights < fewest or _likelihood(one) > _likelihood(end) + _BETTER
+        one.weights < fewest or _likelihood(one) > reached() + _BETTER
         for one in alone(bare, least, lambda: say(doing))
     )
 

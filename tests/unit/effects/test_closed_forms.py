@@ -376,6 +376,10 @@ def test_noise_by_hand(world, apply):
     assert np.array_equal(jammed, np.where(np.arange(17) >= 14, 3.0, 1.0))
     burst = apply("interference[time_0]", excess=2.0)["noise_power"].ravel() / before.ravel()
     assert np.array_equal(burst, np.where(np.arange(8) < 1, 3.0, 1.0))
+    count = np.shape(apply()["noiseless_channel"])[2]
+    each = np.linspace(-0.4, 0.6, count)
+    uneven = apply("noise_imbalance[rx]", log_power=each)["noise_power"] / before
+    assert np.allclose(uneven[:, :, :, 0, 0], np.exp(each))  # the first chain, too
 
 
 def test_interference_reaches_the_lowest_subcarrier_however_its_place_is_rounded(world):

@@ -59,10 +59,11 @@ def test_what_varies_along_a_column_is_not_named_by_one_of_many_places_that_show
     scores[0] = 4.0
     near = FamilyTest(family_of(places), 1e-14, np.ones(9), scores, np.ones(8))
     wave = FamilyTest(family_of(ripples.band(0, 1)), 1e-13, np.ones(9), np.full((9, 1), 10.0), np.ones(1))
-    assert plainest([near, wave]) is wave
-    assert plainest([near, wave._replace(p_value=1e-6)]) is near  # far less sure
+    assert plainest(near, [near, wave]) is wave
+    assert plainest(near, [near, wave._replace(p_value=1e-6)]) is near  # far less sure
     alone = scores.copy()
     alone[0] = [0, 0, 0, 12.0, 0, 0, 0, 0]
-    assert plainest([near._replace(first=alone), wave]).label == "additive, place 3"
+    one = near._replace(first=alone)
+    assert plainest(one, [one, wave]).label == "additive, place 3"
     other = wave._replace(family=dataclasses.replace(wave.family, kind="spread"))
-    assert plainest([near, other]) is near
+    assert plainest(near, [near, other]) is near
