@@ -8,7 +8,7 @@ import sys
 import traceback
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NoReturn
+from typing import Any, NoReturn
 
 from dtprob import __version__
 from dtprob.case import load_case
@@ -33,7 +33,18 @@ COMMANDS = {
 
 
 class Parser(argparse.ArgumentParser):
-    """Answers a mistake with one line that says what to do."""
+    """Answers a mistake with one line that says what to do; `--debug` goes wherever `--help` does."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        """Like those of `argparse.ArgumentParser`."""
+        super().__init__(*args, **kwargs)
+        # without a default, since that of a step would undo what was said before it
+        self.add_argument(
+            "--debug",
+            action="store_true",
+            default=argparse.SUPPRESS,
+            help="show the traceback of an error",
+        )
 
     def error(self, message: str) -> NoReturn:
         """Say what is wrong, the nearest valid word or where to look, and leave with status 2."""
@@ -67,9 +78,7 @@ def parser() -> Parser:
     commands = top.add_subparsers(title="commands", metavar="COMMAND", dest="command", required=True)
 
     def add(name: str, text: str) -> argparse.ArgumentParser:
-        added = commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
-        added.add_argument("--debug", action="store_true", help="show the traceback of an error")
-        return added
+        return commands.add_parser(name, help=text, description=f"{text[0].upper()}{text[1:]}.")
 
     _add_out(add("demo", "diagnose recorded measurements, without any set-up: report.html"))
     _add_case(add("fit", "infer a twin's parameters from data: posterior.nc, summary.json"))
@@ -151,7 +160,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         the exit status: 0 done, 1 the job failed, 2 wrong input, 130 stopped by Ctrl-C.
     """
     options = vars(parser().parse_args(arguments))
-    command, step, debug = options.pop("command"), options.pop("step", "run"), options.pop("debug")
+    command, step, debug = options.pop("command"), options.pop("step", "run"), options.pop("debug", False)
     signal.signal(signal.SIGTERM, _terminate)
     avoid_miscompilation()
     one_thread()

@@ -19,12 +19,14 @@ def phase_error(draw: Float[np.ndarray, "link instant path"], limit: float = 1.0
 
     Args:
         draw: standard normal, one per link, snapshot (or 1, where errors last) and path; at least as many
-            paths as the world has.
+            paths as the world has. Paths that other impairments join to these keep their phases.
         limit: of the size.
     """
 
     def turn(_world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        return rays.scaled(np.exp(1j * size * draw[..., : rays.mask.shape[1]]))
+        joined = max(0, rays.mask.shape[1] - draw.shape[2])
+        errors = np.pad(draw, ((0, 0), (0, 0), (0, joined)))
+        return rays.scaled(np.exp(1j * size * errors[..., : rays.mask.shape[1]]))
 
     def spread(world: World, rays: Rays, sounding: Sounding, size: float) -> Columns:
         each = 1j * size * path_channels(world, rays, sounding)

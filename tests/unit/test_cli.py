@@ -195,6 +195,19 @@ def test_wrong_input_in_a_process_of_its_own(case, tmp_path):
     assert "Traceback" in shown.stderr
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        "--debug withheld score {} --key {}",
+        "withheld --debug score {} --key {}",
+        "withheld score {} --key {} --debug",
+    ],
+)
+def test_debug_goes_before_and_after_a_step(words, capsys, tmp_path):
+    assert main(words.format(tmp_path, tmp_path / "key.json").split()) == 2
+    assert "Traceback" in capsys.readouterr().err
+
+
 def test_a_failure_of_the_job_is_status_1(case, capsys, tmp_path):
     (tmp_path / "line_model.py").write_text(MODEL.replace("slope * x", "slope * x / undefined"))
     assert main(["fit", str(case), "--out", str(tmp_path / "out")]) == 1

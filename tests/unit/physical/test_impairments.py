@@ -246,6 +246,22 @@ def test_two_impairments_cannot_both_replace_the_sum_over_paths(bench):
         bench.simulate((propagation.near_field(), 1.0), (propagation.beam_squint(), 1.0))
 
 
+@pytest.mark.parametrize("family", sorted(FAMILIES))
+def test_any_two_that_do_not_both_replace_the_sum_go_together(family, bench, setting):
+    one = drawn(family, setting)
+    for other in (drawn(name, setting, 1) for name in sorted(FAMILIES)):
+        if not (one.synthesis and other.synthesis):
+            found = bench.simulate((one, 0.01 * one.limit), (other, 0.01 * other.limit))
+            assert np.all(np.isfinite(found.mean))
+
+
+def test_a_phase_error_leaves_a_path_that_was_joined(bench, setting):
+    pole, error_ = drawn("extra_path", setting), drawn("phase_error", setting)
+    both = bench.simulate((pole, 1.0), (error_, 0.3)).mean
+    apart = bench.simulate((error_, 0.3), (pole, 1.0)).mean
+    assert error(both, apart) < RELATIVE
+
+
 def test_impairments_compose_by_stage(bench, sounding):
     late, louder = front_end.timing_offset(), front_end.gain_offset()
     found = bench.simulate((louder, 6.0), (late, 2e-9)).mean
