@@ -11,6 +11,7 @@ from scipy import optimize
 
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.gap.fitting.integrated import based
+from dtprob.gap.fitting.marginal_mode import around, steps
 from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -85,6 +86,19 @@ def test_the_size_of_noise_beside_levels_of_many_devices(factor):
     assert found.x[index] == pytest.approx(there, abs=0.25 * deviation)
     assert found.volume is not None
     assert index in found.volume.index
+
+
+def test_differences_are_taken_within_what_the_data_leave_open():
+    """Sixty levels tell their middle to .2: a tenth of its prior, .5, would leave where the expansion holds."""
+    start = based(Problem(levels, readings(3, 1.0), [], "device"), jax.random.key(0))
+    free = around(start.problem)
+    joint = start.fitted
+    step = steps(free, joint)
+    posterior = np.sqrt(np.diag(joint.covariance))[np.searchsorted(joint.global_index, free.index)]
+    tight = 0.5 * posterior < 0.1 * free.scale
+    assert tight.any()
+    np.testing.assert_allclose(step[tight], 0.5 * posterior[tight])
+    np.testing.assert_allclose(step[~tight], 0.1 * free.scale[~tight])
 
 
 @model(axes={"offset": ("week", "cell"), "y": ("week", "cell")})
