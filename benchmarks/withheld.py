@@ -5,19 +5,20 @@
     python benchmarks/withheld.py study [--answers answers] [--name withheld] [--write]
 
 Every folder below study with a key.json is a track. What a row means is said in docs/withheld.md. Printed as Markdown;
---write keeps it in results/NAME.json, the strata of each track beside it.
+--write keeps it in results/NAME.json, the strata of each track beside it. Cases that rivals have answered too (`dtprob
+withheld run ... --rivals`) make a second table, a column for each method.
 """
 
 import argparse
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from record import record
 
 from dtprob.gap.withheld.answers import Answer
-from dtprob.gap.withheld.score import score
+from dtprob.gap.withheld.score import rival_answers, score
 from dtprob.gap.withheld.targets import against_targets
 
 
@@ -36,11 +37,20 @@ def main() -> None:
     every = [answer for said in tracks.values() for answer in said]
     lines = {"all": against_targets(every, {})} | {n: against_targets(a, {}) for n, a in tracks.items()}
     print(markdown(lines))
+    methods = against_rivals(keys, options.answers)
+    if methods:
+        print(f"\n{markdown(methods)}")
     if options.write:
         strata = {file.parent.name: scored(file, options.answers)["strata"] for file in keys}
         seeds = {file.parent.name: read(file)["seed"] for file in keys}
         counts = {name: len(said) for name, said in tracks.items()}
-        figures = {"cases": counts, "seeds": seeds, "targets": lines, "strata": strata}
+        figures = {
+            "cases": counts,
+            "seeds": seeds,
+            "targets": lines,
+            "strata": strata,
+            "beside rivals": methods,
+        }
         record(options.name, "withheld cases of all tracks", ("dtprob", "jax", "numpyro"), figures)
 
 
@@ -53,6 +63,19 @@ def answered(key: Path, answers: str) -> Iterator[Answer]:
             report = read(own / "report.json") if (own / "report.json").is_file() else None
             seconds = read(own / "timing.json")["seconds"] if report is not None else None
             yield Answer(content["track"], case, report, seconds)
+
+
+def against_rivals(keys: Sequence[Path], answers: str) -> dict[str, list[dict[str, Any]]]:
+    """What each method reached on the cases of all tracks that the rivals answered too; empty where there are none."""
+    every: dict[str, list[Answer]] = {}
+    for key in keys:
+        files = {str(a.truth["name"]): a for a in answered(key, answers) if a.report is not None}
+        rivals = {name: key.parent / answers / name / "rivals.json" for name in files}
+        said = {name: read(file) for name, file in rivals.items() if file.is_file()}
+        own = {name: files[name] for name in said}
+        for method, found in {"diagnosis": own, **rival_answers(own, said)}.items():
+            every.setdefault(method, []).extend(found.values())
+    return {method: against_targets(found, {}) for method, found in every.items() if found}
 
 
 def scored(key: Path, answers: str) -> dict[str, Any]:
@@ -71,7 +94,7 @@ def markdown(lines: Mapping[str, list[dict[str, Any]]]) -> str:
     found = {name: {row["name"]: row for row in rows} for name, rows in lines.items()}
     head = ["", "lambda from", "target", *lines]
     table = [head, ["---"] * len(head)]
-    for row in lines["all"]:
+    for row in next(iter(lines.values())):
         cells = [shown(found[name].get(row["name"])) for name in lines]
         table.append([row["name"], f"{row['from_lambda']:g}", goal(**row["target"]), *cells])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in table)

@@ -79,7 +79,7 @@ def score(
             "answers", "a report for cases of this key", "none", "Give the folder of the answers"
         )
     strata = {(a.kind, a.lambda_): [n for n in answers if _same(answers[n], a)] for a in answers.values()}
-    theirs = _rival_answers(answers, rivals)
+    theirs = rival_answers(answers, rivals)
     return {
         "format": "dtprob.score",
         "version": 2,
@@ -119,10 +119,15 @@ def _same(one: Answer, other: Answer) -> bool:
     return (one.kind, one.lambda_) == (other.kind, other.lambda_)
 
 
-def _rival_answers(
+def rival_answers(
     answers: Mapping[str, Answer], rivals: Mapping[str, Mapping[str, Report]]
 ) -> dict[str, dict[str, Answer]]:
-    """The answers of each rival by the case's name."""
+    """The answers of each rival by the case's name.
+
+    Args:
+        answers: of the diagnosis, whose screening they share, by the case's name.
+        rivals: content of rivals.json by the case's name: what each rival said.
+    """
     found: dict[str, dict[str, Answer]] = {}
     for name, said in rivals.items():
         for rival, report in said.items():
