@@ -3,7 +3,7 @@
 import importlib
 import importlib.util
 import sys
-from collections.abc import Generator
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 from types import ModuleType
@@ -35,6 +35,23 @@ def load_object(name: str, folder: Path) -> Any:
         public = [entry for entry in vars(module) if not entry.startswith("_")]
         raise unknown_name(f"module {module_name}", attribute, public, "name")
     return getattr(module, attribute)
+
+
+def source_files(names: Iterable[str], folder: Path) -> list[Path]:
+    """The files of the modules that have been loaded for some names: these, and what lies in the folder and they import.
+
+    Args:
+        names: as given to `load_object`.
+        folder: the one given there.
+    """
+    named, own = {name.partition(":")[0] for name in names}, folder.resolve()
+    files: set[Path] = set()
+    for name, module in list(sys.modules.items()):
+        file = Path(getattr(module, "__file__", None) or "").resolve()
+        is_beside = file.is_relative_to(own) and not file.is_relative_to(sys.prefix)
+        if file.is_file() and (name in named or (named and is_beside)):
+            files.add(file)
+    return sorted(files)
 
 
 def _load_module(name: str, parts: list[str], folder: Path) -> ModuleType:

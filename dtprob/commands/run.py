@@ -97,23 +97,27 @@ def infer(
         run: whether to resume, and how to tell the progress.
         latents_only: keep draws of what is unknown, and nothing that has an entry for each row of the data.
     """
-    identity = file.with_suffix(".identity")
-    if run.resume and file.is_file() and _read(identity) == _identity(prepared, file):
+    identity, own = file.with_suffix(".identity"), _identity(prepared, file)
+    if run.resume and file.is_file() and _read(identity) == own:
         run.say(f"{file.name} is there already")
         return Posterior.load(file)
-    checkpoint, status = file.with_suffix(".checkpoint"), file.with_suffix(".status.json")
+    checkpoint, status, begun = (file.with_suffix(end) for end in (".checkpoint", ".status.json", ".begun"))
+    resume = run.resume and checkpoint.is_file() and _read(begun) == own
+    if run.resume and checkpoint.is_file() and not resume:
+        run.say("what the case is made of has changed since the checkpoint: beginning anew")
+    write_text(begun, own)
     options = replace(
         LATENTS_ONLY if latents_only else RunOptions(),
         progress=True,
         status_file=status,
         checkpoint=checkpoint,
-        resume=run.resume and checkpoint.is_file(),
+        resume=resume,
     )
     run.say(f"fitting with {prepared.engine.name}")
     posterior = prepared.engine(prepared.key, prepared.model, data, options=options)
     posterior.save(file)
-    write_text(identity, _identity(prepared, file))
-    for temporary in (checkpoint, status):
+    write_text(identity, own)
+    for temporary in (checkpoint, status, begun):
         temporary.unlink(missing_ok=True)
     return posterior
 
@@ -122,6 +126,7 @@ def _identity(prepared: Prepared, file: Path) -> str:
     """What a kept posterior depends on, as text."""
     reference = prepared.case.data.reference
     made_from = prepared.data_sha256 if file.stem == "posterior" or not reference else sha256(reference)
+    made_from += f"\n{prepared.made_of_sha256}"
     return f"dtprob {__version__}\n{prepared.engine!r}\n{prepared.case!r}\n{made_from}\n"
 
 

@@ -265,7 +265,7 @@ def _leg(start: Any, stop: Any) -> tuple[jax.Array, jax.Array]:
 
 def _obstructed(paths: PathSet) -> jax.Array:
     """Links without an existing path of order 0."""
-    direct = jnp.all(jnp.asarray(paths.interaction) == NONE, axis=-1) & paths.mask
+    direct = jnp.all(jnp.asarray(paths.interaction) == NONE, axis=-1) & paths.mask & ~paths.is_untold
     return ~jnp.any(direct, axis=-1)
 
 

@@ -86,7 +86,7 @@ def _met(paths: PathSet) -> np.ndarray:
 
 @jax.jit
 def _crossings(paths: PathSet, start: np.ndarray, stop: np.ndarray) -> jax.Array:
-    """How often each path crosses the upright screen over a line on the floor, (link, path)."""
+    """How often each path crosses the upright screen over a line on the floor, (link, path); 0 where its way is untold."""
     happens = (paths.interaction != NONE)[..., None]
     ends = jnp.broadcast_to(paths.rx_position[:, None, None], paths.vertex.shape)
     first = jnp.broadcast_to(paths.tx_position[:, None, None], ends[:, :, :1].shape)
@@ -104,7 +104,7 @@ def _crossings(paths: PathSet, start: np.ndarray, stop: np.ndarray) -> jax.Array
         return leg[..., 0] * reach[..., 1] - leg[..., 1] * reach[..., 0]
 
     meets = (side_of_line(before) * side_of_line(after) < 0) & (side_of_leg(start) * side_of_leg(stop) < 0)
-    return jnp.sum(meets, axis=-1) * jnp.asarray(paths.mask)
+    return jnp.sum(meets, axis=-1) * (jnp.asarray(paths.mask) & ~paths.is_untold)
 
 
 def _name(start: np.ndarray, stop: np.ndarray) -> str:

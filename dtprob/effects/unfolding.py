@@ -9,7 +9,9 @@ L k by s, and
 A receiver that moves by d gives s = d; a transmitter -M d, with M the product of the mirrors H = I - 2 n n^T
 on the way; a wall that moves by d gives minus its image's shift 2 (n.d) n, mirrored by the walls after it.
 All differences are formed so that nothing moves exactly nothing. What the new geometry does to the reflection
-coefficients is neglected. Source: image method, e.g. ITU-R P.1407 and any text on ray tracing.
+coefficients is neglected. Where the known mirrors do not lead from one direction to the other, at an edge or on a path of
+which another ray tracer does not say how it goes, one more mirror does: lengths are right to first order. Source: image
+method, e.g. ITU-R P.1407 and any text on ray tracing.
 
 What every effect that moves something asks is traced once for all of them.
 """
@@ -17,7 +19,7 @@ What every effect that moves something asks is traced once for all of them.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +29,9 @@ from scipy.constants import speed_of_light
 from dtprob.effects.common import Sites, meets, of_model
 from dtprob.effects.effect import Rewrite
 from dtprob.raytracing.paths import SPECULAR, PathSet
+
+_TURNED: Final = 1e-3
+"""Angle, rad, from which on a path is said to turn where no mirror is known."""
 
 type Shift = Callable[[PathSet, Mapping[str, Any]], Float[Array, "link path 3"]]
 """The shift s of the unfolded end of every path, from the paths and the effect's parameters."""
@@ -81,7 +86,7 @@ def of_receiver(paths: PathSet, displacement: Float[Array, "*link 3"]) -> Float[
 @jax.jit
 def of_transmitter(paths: PathSet, displacement: Float[Array, "*link 3"]) -> Float[Array, "link path 3"]:
     """Shift by a transmitter that moves, (3,) for all links alike or (link, 1, 3)."""
-    vector = jnp.broadcast_to(displacement, paths.arrival.shape)
+    vector = mirror(jnp.broadcast_to(displacement, paths.arrival.shape), *_unknown_mirror(paths))
     for step in range(paths.depth):
         vector = mirror(vector, paths.normal[:, :, step], _reflects(paths, step))
     return -vector
@@ -106,9 +111,21 @@ def of_object(
 @jax.jit
 def to_transmitter(paths: PathSet, vector: Float[Array, "link path 3"]) -> Float[Array, "link path 3"]:
     """A vector at the receiver as the transmitter sees it, through all mirrors backwards."""
+    return mirror(_through_known(paths, vector), *_unknown_mirror(paths))
+
+
+def _through_known(paths: PathSet, vector: Float[Array, "link path 3"]) -> Float[Array, "link path 3"]:
     for step in reversed(range(paths.depth)):
         vector = mirror(vector, paths.normal[:, :, step], _reflects(paths, step))
     return vector
+
+
+def _unknown_mirror(paths: PathSet) -> tuple[Float[Array, "link path 3"], Bool[Array, "link path"]]:
+    """Normal of the mirror that is missing between the directions of departure and arrival, and where one is."""
+    turn = _through_known(paths, jnp.asarray(paths.arrival)) - jnp.asarray(paths.departure)
+    size = jnp.linalg.norm(turn, axis=-1)
+    missing = size > _TURNED
+    return turn / jnp.where(missing, size, 1.0)[..., None], missing
 
 
 def mirror(

@@ -81,8 +81,8 @@ def _attenuated(choose: Choice) -> Any:
 
 
 def _order(paths: PathSet) -> jax.Array:
-    """Number of interactions of every path."""
-    return jnp.sum(jnp.asarray(paths.interaction) != NONE, axis=-1)
+    """Number of interactions of every path; -1 where it is not told."""
+    return jnp.where(paths.is_untold, -1, jnp.sum(jnp.asarray(paths.interaction) != NONE, axis=-1))
 
 
 def _has(code: int) -> Choice:

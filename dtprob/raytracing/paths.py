@@ -23,6 +23,10 @@ INTERACTIONS: Final = {
 }
 
 
+_STRAIGHT: Final = 1 - 1e-6
+"""Cosine of the angle between departure and arrival from which on a path is straight."""
+
+
 class PathSet(eqx.Module):
     """The paths of several links, padded to a common number and depth; `mask` tells which exist.
 
@@ -104,6 +108,12 @@ class PathSet(eqx.Module):
     def depth(self) -> int:
         """Largest number of interactions on a path."""
         return self.interaction.shape[2]
+
+    @property
+    def is_untold(self) -> Bool[Array, "link path"]:
+        """Which paths turn although no interaction says where, as those of other ray tracers do."""
+        along = jnp.sum(jnp.asarray(self.departure) * jnp.asarray(self.arrival), axis=-1)
+        return (along < _STRAIGHT) & jnp.all(jnp.asarray(self.interaction) == NONE, axis=-1)
 
     @property
     def n_object(self) -> int:

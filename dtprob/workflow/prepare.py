@@ -21,10 +21,10 @@ from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
 from dtprob.models.arguments import Model
 from dtprob.models.declaration import declare
-from dtprob.usercode import load_object
+from dtprob.usercode import load_object, source_files
 from dtprob.workflow.columns import check_columns
 from dtprob.workflow.models import MODELS
-from dtprob.workflow.scene import reached
+from dtprob.workflow.scene import reached, scene_files
 
 type Say = Callable[[str], None]
 
@@ -44,6 +44,7 @@ class Prepared:
         key: the typed JAX key of the case's seed.
         cluster: the axis or column whose values belong together; None for the model's own.
         data_sha256: hash of the data file.
+        made_of_sha256: hash of the user's own code and of the scene's files.
     """
 
     case: Case
@@ -56,6 +57,7 @@ class Prepared:
     key: jax.Array
     cluster: str | None
     data_sha256: str
+    made_of_sha256: str
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -111,7 +113,14 @@ def prepare(
     model = _extended(case, model, arguments)
     key, digest = jax.random.key(case.seed.value), sha256(case.data.file)
     cluster = case.data.cluster
-    return Prepared(case, model, arguments, reference, designs, effects, engine, key, cluster, digest)
+    sources = [
+        *source_files(case.user_code, case.folder),
+        *([] if case.scene is None else scene_files(case.scene)),
+    ]
+    made_of = hashlib.sha256("".join(map(sha256, sources)).encode()).hexdigest()
+    return Prepared(
+        case, model, arguments, reference, designs, effects, engine, key, cluster, digest, made_of
+    )
 
 
 def make_engine(section: EngineSection, where: str) -> AbstractEngine:

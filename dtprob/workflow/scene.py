@@ -3,6 +3,7 @@
 import dataclasses
 import hashlib
 import json
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,6 +24,8 @@ from dtprob.raytracing.beyond import strongest, with_beyond
 from dtprob.raytracing.paths import PathSet
 
 _WALL_THICKNESS = 0.12
+_MESH = re.compile(r"""name\s*=\s*["']filename["']\s+value\s*=\s*["']([^"']+)["']""")
+"""How a scene names the file of a mesh or a picture."""
 _APART = 1e-2
 """Ends closer than this, in m, cannot be traced."""
 _MOST_BEYOND = 64
@@ -68,7 +71,7 @@ def paths_of(
         case: the CASE, with its scene.
         data: the positions of the links.
         cache: a folder in which traced paths are kept.
-        say: receives one line before tracing.
+        say: receives one line before tracing, or where the paths are those of an earlier run.
 
     Raises:
         InputError: no scene, a scene or path set that cannot be used, or a path set of other positions.
@@ -82,6 +85,7 @@ def paths_of(
         return _same_links(storage.load(scene.file), _placed(scene, data), case)
     kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
     if kept is not None and kept.is_file():
+        say(f"taking the paths that were traced before, {kept.name}")
         return storage.load(kept)
     say(f"tracing {len(data.rx_position)} links through {Path(scene.file).name}")
     paths = _trace(scene, _placed(scene, data))
@@ -198,12 +202,20 @@ class _Traced(NamedTuple):
 def _scene_hash(scene: SceneSection, data: ChannelData | PowerData) -> str:
     """What a traced path set depends on, in 16 characters."""
     digest = hashlib.sha256(json.dumps(dataclasses.asdict(scene), sort_keys=True).encode())
-    file = Path(scene.file)
-    if file.suffix.lower() in {".xml", ".json"} and file.is_file():
+    for file in scene_files(scene):
         digest.update(file.read_bytes())
     for positions in (data.tx_position, data.rx_position):
         digest.update(positions.tobytes())
     return digest.hexdigest()[:16]
+
+
+def scene_files(scene: SceneSection) -> list[Path]:
+    """The files that a scene is made of: its own, and the meshes that a Mitsuba XML names; none of a shipped one."""
+    file = Path(scene.file)
+    if not file.is_file():
+        return []
+    meshes = _MESH.findall(file.read_text(encoding="utf-8")) if file.suffix.lower() == ".xml" else []
+    return [file, *sorted(mesh for mesh in {file.parent / name for name in meshes} if mesh.is_file())]
 
 
 def _same_links(paths: PathSet, data: ChannelData | PowerData, case: Case) -> PathSet:

@@ -9,10 +9,12 @@ import sys
 import time
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 
 from dtprob.cli import COMMANDS, main, parser
+from dtprob.inference import Posterior
 
 MODEL = """
 import jax.numpy as jnp
@@ -273,6 +275,27 @@ def test_a_finished_fit_is_kept_by_resume_only_while_nothing_changed(case, capsy
     assert main([*words, "--seed", "1"]) == 0
     assert "there already" not in capsys.readouterr().out
     assert (out / "summary.json").read_bytes() != first
+
+
+def test_resume_keeps_no_posterior_of_another_model(case, capsys, tmp_path):
+    out = tmp_path / "out"
+    words = ["fit", str(case), "--out", str(out), "--resume"]
+    assert main(words) == 0
+    (tmp_path / "line_model.py").write_text(MODEL.replace("slope * x", "2 * slope * x"))
+    del sys.modules["line_model"]
+    assert main(words) == 0
+    assert "there already" not in capsys.readouterr().out
+    assert float(Posterior.load(out / "posterior.nc").sample(jax.random.key(0), 20)["slope"].mean()) < 1.2
+
+
+def test_a_checkpoint_of_another_run_is_not_gone_on_with(case, capsys, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "posterior.checkpoint").write_text("of something else")
+    (out / "posterior.begun").write_text("something else")
+    assert main(["fit", str(case), "--out", str(out), "--resume"]) == 0
+    assert "beginning anew" in capsys.readouterr().out
+    assert {entry.name for entry in out.iterdir()} == {"posterior.nc", "posterior.identity", "summary.json"}
 
 
 def test_a_failed_run_leaves_no_results_of_an_earlier_one(case, tmp_path):

@@ -131,6 +131,36 @@ def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
     assert len(traced) == 2
 
 
+def test_a_scene_whose_mesh_has_changed_is_traced_again(folder, monkeypatch):
+    from dtprob.workflow import scene
+
+    change(folder, 'file = "paths.nc"', 'file = "street.xml"')
+    mesh = folder / "meshes" / "house.ply"
+    mesh.parent.mkdir()
+    mesh.write_text("a house")
+    (folder / "street.xml").write_text(
+        '<scene version="2.1.0"><shape type="ply"><string name="filename" value="meshes/house.ply"/></shape></scene>'
+    )
+    traced, said = [], []
+
+    def fake_trace(section, data):
+        traced.append(section.file)
+        return storage.load(folder / "paths.nc")
+
+    monkeypatch.setattr(scene, "_trace", fake_trace)
+    case = load_case(folder / "case.toml")
+    first = prepare(case, need="fit", cache=folder / "out")
+    assert (
+        prepare(case, need="fit", cache=folder / "out", say=said.append).made_of_sha256
+        == first.made_of_sha256
+    )
+    assert len(traced) == 1
+    assert any("traced before" in line for line in said)
+    mesh.write_text("a house that has moved")
+    assert prepare(case, need="fit", cache=folder / "out").made_of_sha256 != first.made_of_sha256
+    assert len(traced) == 2
+
+
 REFUSED = {
     "other model's phase": (
         ('name = "ray_traced_channel"', 'name = "phase_error_channel"'),
