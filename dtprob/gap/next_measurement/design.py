@@ -44,7 +44,7 @@ class Design(NamedTuple):
     """A measurement that could be made.
 
     Attributes:
-        where: its coordinates, for the user.
+        where: its coordinates, for the user; `design` among them names the set to which it belongs.
         cost: of making it once.
         predictions: one for each rival.
     """
@@ -142,29 +142,40 @@ def rank(designs: Sequence[Design], needed: float = NEEDED, most: int = MOST) ->
 def recommend(designs: Sequence[Design], needed: float = NEEDED, most: int = MOST) -> Ranked:
     """The cheapest plan that is found: one design or several, all repeated alike, joined one by one while that is cheaper.
 
-    Several places together can tell what each alone cannot, as a slope from a level.
+    Several places together can tell what each alone cannot, as a slope from a level. Those of a plan belong to one set, and
+    each is in it once: repeats are counted apart.
 
     Args:
         designs: the candidates; the rivals' predictions have the same parameters in each.
         needed: nats that are enough.
         most: repeats beyond which no plan is followed.
     """
+    roots, sets = _roots_of(designs), dict.fromkeys(map(_set_of, designs))
+    plans = [_plan([one for one in designs if _set_of(one) == kind], needed, most, roots) for kind in sets]
+    return min(plans, key=_price)
+
+
+def _plan(designs: Sequence[Design], needed: float, most: int, roots: _Roots) -> Ranked:
+    """The cheapest plan that is found of designs of one set."""
     order = {id(one): number for number, one in enumerate(designs)}
-    roots = _roots_of(designs)
     alone = sorted(
         ((_repeated(one, needed, most, roots), one) for one in designs), key=lambda two: _price(two[0])
     )
-    pool = [one for _, one in alone[:_POOL]]
-    chosen, best = pool[:1], alone[0][0]
-    while len(chosen) < _PLACES:
-        plans = [joined([*chosen, other]) for other in pool]
-        found = [_repeated(plan, needed, most, roots) for plan in plans]
-        number = min(range(len(pool)), key=lambda k: _price(found[k]))
+    best, others = alone[0][0], [one for _, one in alone[1:_POOL]]
+    chosen = [alone[0][1]]
+    while others and len(chosen) < _PLACES:
+        found = [_repeated(joined([*chosen, other]), needed, most, roots) for other in others]
+        number = min(range(len(others)), key=lambda k: _price(found[k]))
         if _price(found[number]) >= _price(best):
             break
-        chosen.append(pool[number])
+        chosen.append(others.pop(number))
         best = found[number]
     return best._replace(where=_merged([one.where for one in sorted(chosen, key=lambda one: order[id(one)])]))
+
+
+def _set_of(one: Design) -> tuple[Any, frozenset[str]]:
+    """Designs with the same are told together."""
+    return one.where.get("design"), frozenset(one.where)
 
 
 def joined(designs: Sequence[Design]) -> Design:
@@ -201,10 +212,10 @@ def _apart(designs: Sequence[Design], parts: Sequence[Prediction]) -> Float[np.n
 
 
 def _merged(places: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Coordinates of several designs: one value where all agree, else a list in their order."""
+    """Coordinates of several designs of one set: one value where all agree, else a list in their order."""
     merged: dict[str, Any] = {}
-    for axis in dict.fromkeys(axis for place in places for axis in place):
-        values = [place[axis] for place in places if axis in place]
+    for axis in places[0]:
+        values = [place[axis] for place in places]
         merged[axis] = values[0] if all(value == values[0] for value in values) else values
     return merged
 

@@ -121,6 +121,32 @@ def test_a_plan_of_one_place_is_the_first_of_the_ranking():
     assert recommend(designs) == rank(designs)[0]
 
 
+def test_a_plan_does_not_hide_repeats():
+    """One place that takes 1,500 repeats is not told as one that takes 750 of itself twice."""
+    none = np.zeros((1, 0)), np.zeros((0, 0))
+    gap = np.sqrt(2 * 3.0001 / 1500)
+    one = Design({"row": 3}, 1.0, tuple(Prediction(np.array([m]), *none) for m in (0.0, gap)))
+    assert recommend([one]) == rank([one])[0]
+    assert not recommend([one]).resolves
+    assert recommend([one], most=2000).repeats == 1500
+
+
+def test_a_plan_is_of_one_set_of_designs():
+    """A level and a slope need two places; those of two sets are not told under one name."""
+    level = np.ones((1, 1)), np.full((1, 1), 25.0)
+
+    def places(name, gaps):
+        return [
+            Design({**name, "row": k}, 1.0, tuple(Prediction(np.array([m]), *level) for m in (0.0, gap)))
+            for k, gap in enumerate(gaps)
+        ]
+
+    here, there = places({}, (3.0,)), places({"design": "elsewhere"}, (-3.0, 2.5))
+    found = recommend([*here, *there], most=8)
+    assert found.resolves
+    assert found.where == {"design": "elsewhere", "row": [0, 1]}
+
+
 def linear(x, power):
     """Design matrix of a line and one term more."""
     return np.column_stack([np.ones_like(x), x, np.abs(x) ** power])
