@@ -66,6 +66,23 @@ def check_arrays(arrays: Mapping[str, object], specs: Mapping[str, ArraySpec]) -
     return checked
 
 
+def side_by_side(columns: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Columns of equal length as one array (row, column).
+
+    Args:
+        columns: by name.
+
+    Raises:
+        InputError: columns of other lengths than the first.
+    """
+    first, *_ = lengths = {name: np.shape(column) for name, column in columns.items()}
+    for name, shape in lengths.items():
+        if len(shape) != 1 or shape != lengths[first]:
+            expected = f"{lengths[first][0] if lengths[first] else 1} values in a row, as {first} has"
+            raise InputError(name, expected, f"shape {shape}", "Give all columns the same rows")
+    return np.stack([np.asarray(column) for column in columns.values()], axis=1)
+
+
 def _check(name: str, array: np.ndarray, spec: ArraySpec, sizes: dict[str, int]) -> np.ndarray:
     array = _convert(name, array, spec.kind)
     shape = _match(name, array.shape, spec.shapes, sizes)

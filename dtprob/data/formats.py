@@ -177,7 +177,8 @@ def _columns(frame: Any) -> Arrays:
         if column.dtype.kind in "biuf":
             columns[str(name)] = column.to_numpy(dtype=float if column.dtype.kind == "f" else None)
         else:
-            columns[str(name)] = column.astype(str).to_numpy(dtype=str)
+            words = ["" if absent else str(word) for word, absent in zip(column, column.isna(), strict=True)]
+            columns[str(name)] = np.array(words, dtype=str)
     return columns
 
 

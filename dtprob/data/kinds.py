@@ -103,7 +103,8 @@ class ChannelData(_OfLinks):
         repeat: equal labels mark snapshots that measure the same thing again.
 
     Raises:
-        InputError: arrays that do not fit together, NaN or infinity, a noise power that is not positive.
+        InputError: arrays that do not fit together, NaN or infinity, a noise power that is not positive, subcarriers all at
+            one frequency.
     """
 
     channel: Complex[np.ndarray, "link snapshot rx_antenna tx_antenna subcarrier"]
@@ -118,6 +119,11 @@ class ChannelData(_OfLinks):
 
     def __post_init__(self) -> None:
         self._check(CHANNEL_ARRAYS)
+        frequency = self.subcarrier_frequency
+        if len(frequency) > 1 and np.ptp(frequency) == 0:
+            got = f"{frequency[0]:g} Hz for all {len(frequency)}"
+            remedy = "Give each subcarrier's own frequency, in Hz from the carrier"
+            raise InputError("subcarrier_frequency", "different frequencies", got, remedy)
         _check_array(self.rx_array, "rx_array", self.channel.shape[2])
         _check_array(self.tx_array, "tx_array", self.channel.shape[3])
 

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from dtprob.data.arrays import ArraySpec, check_arrays, side_by_side
 from dtprob.data.kinds import NetworkLog
 from dtprob.data.network_rows import DEVICE_COLUMNS, split_gaps
 from dtprob.errors import InputError, unknown_name
@@ -36,10 +37,13 @@ def from_columns(columns: Mapping[str, np.ndarray], *, allow_gaps: bool = False)
             if f"{column}_{device}" not in columns:
                 remedy = "Give every device from 0 its four columns"
                 raise InputError(f"{column}_{device}", "a column", "nothing", remedy)
-        logged[column] = np.stack([columns[f"{column}_{device}"] for device in range(devices)], axis=1)
+        own = [f"{column}_{device}" for device in range(devices)]
+        logged[column] = side_by_side({name: columns[name] for name in own})
     if not len(logged["slot"]):
         raise InputError("episode", "at least one row", "an empty table", "Log one slot or more")
     if allow_gaps:
+        whole = ArraySpec((("row",),), kind="integer")
+        logged |= check_arrays({n: logged[n] for n in ("episode", "slot")}, {"episode": whole, "slot": whole})
         logged["episode"] = split_gaps(logged["episode"], logged["slot"])
     return NetworkLog(**logged)
 

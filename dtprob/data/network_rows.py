@@ -47,30 +47,34 @@ def check_rows(log: Rows, order: Int[np.ndarray, " row"]) -> None:
             an empty buffer, or a buffer that cannot follow from the one before; the row of the file is named.
     """
     for name in ("action", "ack", "arrival"):
-        values = getattr(log, name)
-        if (highest := values.max()) > 1:
-            place = where(log, order, values > 1)
+        if (bad := (values := getattr(log, name)) > 1).any():
+            got = f"{values[_first(order, bad)].max()} in {where(log, order, bad)}"
             remedy = f"Give {name} as 0 or 1 per device and slot"
-            raise InputError(name, "0 or 1", f"{highest} in {place}", remedy)
+            raise InputError(_column(name, order, bad), "0 or 1", got, remedy)
     _check_order(log, order)
     if (bad := (log.ack > 0) & (log.action == 0)).any():
         remedy = "A packet is delivered only in a slot in which it is sent; correct the row"
         raise InputError(
-            _column("ack", bad), "0 where the action is 0", f"1 in {where(log, order, bad)}", remedy
+            _column("ack", order, bad), "0 where the action is 0", f"1 in {where(log, order, bad)}", remedy
         )
     if (bad := (log.ack > 0) & (log.buffer == 0)).any():
         remedy = "An empty buffer has nothing to deliver; correct the row"
         raise InputError(
-            _column("ack", bad), "0 where the buffer is 0", f"1 in {where(log, order, bad)}", remedy
+            _column("ack", order, bad), "0 where the buffer is 0", f"1 in {where(log, order, bad)}", remedy
         )
     _check_buffers(log, order)
 
 
 def where(log: Rows, order: Int[np.ndarray, " row"], bad: Bool[np.ndarray, "..."]) -> str:
     """The first bad row in words: its number in the file from 1 (below a header), episode and slot."""
-    index = np.flatnonzero(bad.reshape(len(order), -1).any(axis=1))
-    first = int(index[np.argmin(order[index])])
+    first = _first(order, bad)
     return f"row {order[first] + 1} (episode {log.episode[first]}, slot {log.slot[first]})"
+
+
+def _first(order: Int[np.ndarray, " row"], bad: Bool[np.ndarray, "..."]) -> int:
+    """Which of the bad rows stands first in the file, by its number among the sorted ones."""
+    index = np.flatnonzero(bad.reshape(len(order), -1).any(axis=1))
+    return int(index[np.argmin(order[index])])
 
 
 def follows(log: Rows) -> Bool[np.ndarray, " row"]:
@@ -92,12 +96,12 @@ def split_gaps(episode: Int[np.ndarray, " row"], slot: Int[np.ndarray, " row"]) 
 def _check_order(log: Rows, order: Int[np.ndarray, " row"]) -> None:
     step, inside = np.diff(log.slot, prepend=log.slot[:1]), follows(log)
     if (bad := inside & (step == 0)).any():
-        row = int(np.argmax(bad))
+        row = _first(order, bad)
         got = f"slot {log.slot[row]} of episode {log.episode[row]} twice, again in {where(log, order, bad)}"
         remedy = "Number the slots within each episode"
         raise InputError("slot", "each slot of an episode once", got, remedy)
     if (bad := inside & (step > 1)).any():
-        row = int(np.flatnonzero(bad)[np.argmin(order[np.flatnonzero(bad)])])
+        row = _first(order, bad)
         expected = f"slot {log.slot[row - 1] + 1} of episode {log.episode[row]}"
         remedy = (
             "Add the missing slots, or set allow_gaps = true in [data.options] to split the episode there"
@@ -105,7 +109,7 @@ def _check_order(log: Rows, order: Int[np.ndarray, " row"]) -> None:
         raise InputError("slot", expected, where(log, order, bad), remedy)
     jump = np.diff(log.episode, prepend=log.episode[:1])
     if (bad := jump > 1).any():
-        row = int(np.argmax(bad))
+        row = _first(order, bad)
         got = f"none: after episode {log.episode[row - 1]} comes {where(log, order, bad)}"
         remedy = "Number the episodes without gaps, or set allow_gaps = true in [data.options]"
         raise InputError("episode", f"a slot or more of episode {log.episode[row - 1] + 1}", got, remedy)
@@ -116,8 +120,9 @@ def _check_buffers(log: Rows, order: Int[np.ndarray, " row"]) -> None:
     after, inside = np.roll(log.buffer, -1, axis=0), np.append(follows(log)[1:], False)
     bad = inside[:, None] & ((after < kept) | (after > kept + log.arrival))
     if bad.any():
-        row, device = (int(i) for i in np.argwhere(bad)[0])
         shifted = np.roll(bad, 1, axis=0)
+        row = _first(order, shifted) - 1
+        device = int(np.argmax(bad[row]))
         expected = f"{kept[row, device]}" + (
             f" or {kept[row, device] + 1}" if log.arrival[row, device] else ""
         )
@@ -126,5 +131,6 @@ def _check_buffers(log: Rows, order: Int[np.ndarray, " row"]) -> None:
         raise InputError(f"buffer_{device}", f"{expected} after the slot before", got, remedy)
 
 
-def _column(name: str, bad: Bool[np.ndarray, "row device"]) -> str:
-    return f"{name}_{int(np.flatnonzero(bad.any(axis=0))[0])}"
+def _column(name: str, order: Int[np.ndarray, " row"], bad: Bool[np.ndarray, "row device"]) -> str:
+    """The first bad column of the first bad row."""
+    return f"{name}_{int(np.argmax(bad[_first(order, bad)]))}"

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dtprob.data import network, uwb_apartment
-from dtprob.data.arrays import ArraySpec
+from dtprob.data.arrays import ArraySpec, side_by_side
 from dtprob.data.formats import Arrays, load_arrays
 from dtprob.data.kinds import (
     CHANNEL_ARRAYS,
@@ -152,7 +152,7 @@ def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
             raise InputError(
                 "x", f"columns x_0 to x_{len(numbered) - 1}", ", ".join(numbered), "Number them from 0"
             )
-        arrays["x"] = np.stack([arrays.pop(name) for name in numbered], axis=1)
+        arrays["x"] = side_by_side({name: arrays.pop(name) for name in numbered})
     optional = ("prediction", "weight", "context")
     for name in arrays:
         if name not in {"x", "y", *optional}:

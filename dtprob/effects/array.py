@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from dtprob.effects.common import (
+    COMPLEX,
     Data,
     Family,
     Sites,
@@ -62,10 +63,14 @@ def array_calibration(sites: Sites, _data: Data) -> list[Effect]:
                 jnp.concatenate([first, p["log_gain"]]), jnp.concatenate([first, p["phase"]])
             )
 
+        others = tuple(map(str, range(1, count)))
         whole = Effect(
             "array_calibration",
             {f"{side}_response": weigh_all},
-            (normal("log_gain", 0.2, "Np", count - 1), normal("phase", 0.5, "rad", count - 1)),
+            (
+                normal("log_gain", 0.2, "Np", count - 1, others),
+                normal("phase", 0.5, "rad", count - 1, others),
+            ),
             instance=side,
             physics=f"Unknown complex gains of the {side} elements, the first one being the reference.",
             source="diag(exp(g + j phi)) on the array response.",
@@ -134,6 +139,8 @@ def mutual_coupling(sites: Sites, data: Data) -> list[Effect]:
         if array is None:
             continue
         neighbours = _neighbours(array)
+        kinds = [f"{kind}_" for kind in range(len(neighbours))] if len(neighbours) > 1 else [""]
+        labels = tuple(f"{kind}{part}" for kind in kinds for part in COMPLEX)
 
         def couple(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], masks: Any = neighbours) -> Any:
             shares = complex_of(p["coupling"].reshape(-1, 2))
@@ -143,7 +150,7 @@ def mutual_coupling(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "mutual_coupling",
                 {f"{side}_response": couple},
-                (normal("coupling", 0.1, "1", 2 * len(neighbours)),),
+                (normal("coupling", 0.1, "1", 2 * len(neighbours), labels),),
                 instance=side,
                 physics=f"Complex coupling of neighbouring {side} elements (real, imaginary), alike for pairs that stand"
                 f" alike: {len(neighbours)} kinds.",

@@ -25,10 +25,19 @@ SIDES: Final = ("rx", "tx")
 """The two ends of a link."""
 
 
-def normal(name: str, scale: float, unit: str = "1", size: int | None = None) -> Parameter:
-    """A parameter that may take either sign, N(0, scale^2), one number or a vector of `size`."""
+DIRECTIONS: Final = ("x", "y", "z")
+"""Of the world's axes."""
+COMPLEX: Final = ("real", "imaginary")
+"""The entries of a complex number."""
+
+
+def normal(
+    name: str, scale: float, unit: str = "1", size: int | None = None, labels: tuple[str, ...] = ()
+) -> Parameter:
+    """A parameter that may take either sign, N(0, scale^2), one number or a vector of `size`, its entries labelled."""
     prior = dist.Normal(0.0, scale)
-    return Parameter(name, prior if size is None else prior.expand((size,)).to_event(1), 0.0, unit)
+    whole = prior if size is None else prior.expand((size,)).to_event(1)
+    return Parameter(name, whole, 0.0, unit, labels=labels)
 
 
 def half_normal(name: str, scale: float, unit: str = "1") -> Parameter:
@@ -239,6 +248,11 @@ def observable_basis(
 def along(basis: Float[np.ndarray, "rank 3"]) -> str:
     """The directions of a basis as text."""
     return ", ".join("(" + " ".join(f"{x:.2f}" for x in np.round(row, 2) + 0.0) + ")" for row in basis)
+
+
+def axis_labels(basis: Float[np.ndarray, "rank 3"]) -> tuple[str, ...]:
+    """Labels of the components along a basis: the world's axes where it is these; none, so indices, elsewhere."""
+    return DIRECTIONS if len(basis) == len(DIRECTIONS) else ()
 
 
 def each_antenna(count: int, side: str) -> list[tuple[int, str]]:

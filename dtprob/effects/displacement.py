@@ -11,10 +11,12 @@ import numpy as np
 
 from dtprob.effects import unfolding
 from dtprob.effects.common import (
+    DIRECTIONS,
     Data,
     Family,
     Sites,
     along,
+    axis_labels,
     half_normal,
     normal,
     observable_basis,
@@ -41,7 +43,7 @@ def receiver_displacement(sites: Sites, data: Data) -> list[Effect]:
     common = Effect(
         "receiver_displacement",
         unfolding.rewrites(sites, lambda paths, p: unfolding.of_receiver(paths, p["displacement"])),
-        (normal("displacement", _SIZE, "m", 3),),
+        (normal("displacement", _SIZE, "m", 3, DIRECTIONS),),
         physics="All receivers stand a common vector away from their recorded positions.",
         source=_IMAGE,
         requires=("paths",),
@@ -57,7 +59,7 @@ def transmitter_displacement(sites: Sites, data: Data) -> list[Effect]:
     common = Effect(
         "transmitter_displacement",
         unfolding.rewrites(sites, lambda paths, p: unfolding.of_transmitter(paths, p["displacement"])),
-        (normal("displacement", _SIZE, "m", 3),),
+        (normal("displacement", _SIZE, "m", 3, DIRECTIONS),),
         physics="All transmitters stand a common vector away from their recorded positions.",
         source=_IMAGE,
         requires=("paths",),
@@ -85,7 +87,7 @@ def object_displacement(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "object_displacement",
                 unfolding.rewrites(sites, shift),
-                (normal("displacement", _SIZE, "m", len(basis)),),
+                (normal("displacement", _SIZE, "m", len(basis), axis_labels(basis)),),
                 instance=name,
                 physics=f"{name} stands away from its place in the scene, along {along(basis)}.",
                 source=_IMAGE,
@@ -117,7 +119,7 @@ def object_rotation(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "object_rotation",
                 unfolding.rewrites(sites, shift),
-                (normal("rotation", _TURN, "rad", len(basis)),),
+                (normal("rotation", _TURN, "rad", len(basis), axis_labels(basis)),),
                 instance=name,
                 physics=f"{name} is turned about its centre, around {along(basis)}.",
                 source="d = omega x (v - c) at each point of reflection; " + _IMAGE,
@@ -184,7 +186,7 @@ def _one_place(end: str, sites: Sites, data: Data, shift: Any) -> list[Effect]:
         Effect(
             f"{end}_displacement",
             unfolding.rewrites(sites, partial(shift_some, place=place)),
-            (normal("displacement", _SIZE, "m", 3),),
+            (normal("displacement", _SIZE, "m", 3, DIRECTIONS),),
             instance=f"{end}_{number}",
             physics=f"The {end} recorded at ({' '.join(f'{x:.1f}' for x in place)}) m stands a vector away from there.",
             source=_IMAGE,

@@ -43,6 +43,7 @@ class Parameter:
             long as the effect's sizes are at their null, and its prior holds as it stands, however small the effect.
         tried: values of a place at which an effect of one size is looked for before it is fitted; its prior, a normal one,
             is then centred at the best of them.
+        labels: what its entries are called in a report, one after another; their indices where none are given.
     """
 
     name: str
@@ -51,9 +52,15 @@ class Parameter:
     unit: str = "1"
     is_place: bool = False
     tried: tuple[float, ...] = ()
+    labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that what is looked for at several values is one place."""
+        """Check that what is looked for at several values is one place, and that each entry has its label."""
+        if self.labels and len(self.labels) != self.size:
+            got = f"{len(self.labels)}"
+            raise InputError(
+                f"labels of parameter {self.name}", f"{self.size}, one for each entry", got, "Correct them."
+            )
         if len(self.tried) and not (self.is_place and not self.shape and isinstance(self.prior, dist.Normal)):
             expected = "is_place=True and a normal prior of one number where values are tried"
             got = f"is_place={self.is_place}, {type(self.prior).__name__} of shape {self.shape}"
@@ -75,8 +82,11 @@ class Parameter:
         base = self.prior
         while isinstance(base, dist.ExpandedDistribution | dist.Independent):
             base = base.base_dist
-        if isinstance(base, dist.Normal | dist.HalfNormal | dist.StudentT | dist.Cauchy | dist.HalfCauchy):
+        if isinstance(base, dist.HalfNormal | dist.HalfCauchy):
             return np.asarray(base.scale)
+        if isinstance(base, dist.Normal | dist.StudentT | dist.Cauchy):
+            away = 0.0 if self.is_place else np.asarray(base.loc) - self.null
+            return np.hypot(np.asarray(base.scale), away)
         try:
             square = np.asarray(self.prior.variance) + (np.asarray(self.prior.mean) - self.null) ** 2
         except NotImplementedError:

@@ -17,6 +17,8 @@ from jaxtyping import Array, Complex, Float
 from scipy.constants import speed_of_light
 
 from dtprob.effects.common import (
+    COMPLEX,
+    DIRECTIONS,
     Band,
     Data,
     Family,
@@ -42,7 +44,6 @@ from dtprob.raytracing.paths import NONE, PathSet
 _NEEDS: Final = ("paths", "subcarrier_frequency", "path_phase", "frequency_response")
 _TAPS: Final = 16
 """Taps of the diffuse tail at most."""
-_AXES: Final = ("x", "y", "z")
 _STEP: Final = 2.0
 """Step in m between places of a scatterer where nothing tells delays apart."""
 _MOST: Final = 600
@@ -69,7 +70,7 @@ def extra_path(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "extra_path",
                 {"noiseless_channel": scatter},
-                (normal("scattering", 1.0, "m", 2),),
+                (normal("scattering", 1.0, "m", 2, COMPLEX),),
                 instance=name,
                 physics=f"A point at {_text(centre)} on {name} scatters to all links; the size is the complex"
                 " square root of its radar cross section (real, imaginary).",
@@ -89,7 +90,7 @@ def _over_any_point(paths: PathSet, measured: Band | None) -> Effect:
     tried.append(np.linspace(low[2], high[2], _HEIGHTS) if high[2] - low[2] > step / 2 else low[2:])
 
     def scatter(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
-        point = jnp.stack([p[axis] for axis in _AXES])
+        point = jnp.stack([p[axis] for axis in DIRECTIONS])
         echo = _echo(context, point, carrier=False)
         return value + p["scale"] / jnp.sqrt(2.0) * complex_of(p[FIELD]) * echo
 
@@ -101,7 +102,7 @@ def _over_any_point(paths: PathSet, measured: Band | None) -> Effect:
             half_normal("scale", 1.0, "m"),
             *(
                 place(axis, values, "m", centre=float(middle), spread=float(spread))
-                for axis, values, middle, spread in zip(_AXES, tried, middles, spreads, strict=True)
+                for axis, values, middle, spread in zip(DIRECTIONS, tried, middles, spreads, strict=True)
             ),
         ),
         instance="anywhere",

@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int
 
 from dtprob.effects.common import (
+    COMPLEX,
     Band,
     Data,
     Family,
@@ -28,7 +29,7 @@ from dtprob.effects.common import (
     on_axis,
     phasor,
 )
-from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.meaning import CHANNEL_AXES
 
 _RIPPLES: Final = np.arange(1.5, 16.25, 0.5)
@@ -102,7 +103,7 @@ def frequency_response(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "frequency_response",
                 {"frequency_response": lambda value, p, context: value * _smooth(measured, p, context)},
-                (normal("log_gain", 0.1, "Np", 5), normal("phase", 0.1, "rad", 4)),
+                _smooth_sizes(),
                 physics="Smooth response of the whole chain, its mean gain and its delay included.",
                 source="exp(sum_n a_n P_n(x) + j sum_m b_m P_m(x)), Legendre, n = 0..4, m = 1..4.",
                 requires=("subcarrier_frequency",),
@@ -118,7 +119,7 @@ def frequency_response(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "frequency_response",
                 {"noiseless_channel": weigh},
-                (normal("log_gain", 0.1, "Np", 5), normal("phase", 0.1, "rad", 4)),
+                _smooth_sizes(),
                 instance=name,
                 physics=f"Smooth response of the chain of receiving antenna {index} alone.",
                 source="As for the whole chain.",
@@ -126,6 +127,12 @@ def frequency_response(sites: Sites, data: Data) -> list[Effect]:
             )
         )
     return effects
+
+
+def _smooth_sizes() -> tuple[Parameter, Parameter]:
+    """Coefficients of Legendre polynomials, labelled by their degree."""
+    gains, phases = (tuple(map(str, range(first, 5))) for first in (0, 1))
+    return normal("log_gain", 0.1, "Np", 5, gains), normal("phase", 0.1, "rad", 4, phases)
 
 
 def _smooth(
@@ -154,7 +161,7 @@ def frequency_ripple(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "frequency_ripple",
                 {"frequency_response": echo},
-                (normal("echo", 0.05, "1", 2),),
+                (normal("echo", 0.05, "1", 2, COMPLEX),),
                 instance=f"{cycles:g}_cycles",
                 physics=f"An echo {cycles / measured.width:.3g} s late, {cycles:g} cycles over the band.",
                 source="1 + g exp(-j 2 pi f_k m / B), g complex (real, imaginary).",

@@ -16,6 +16,7 @@ from dtprob.effects.common import (
     Family,
     Sites,
     along,
+    axis_labels,
     band,
     clock,
     half_normal,
@@ -89,7 +90,15 @@ def _doppler(
     return Effect(
         "doppler",
         {"path_phase": turn},
-        (normal("velocity", min(_SPEED, 0.5 * paths.wavelength / time.step), "m/s", len(basis)),),
+        (
+            normal(
+                "velocity",
+                min(_SPEED, 0.5 * paths.wavelength / time.step),
+                "m/s",
+                len(basis),
+                axis_labels(basis),
+            ),
+        ),
         instance=instance,
         physics=f"{text} with a constant velocity during the snapshots.",
         source="phase = -2 pi / lambda (dL/dt) t; the prior ends where a snapshot step turns half a cycle.",

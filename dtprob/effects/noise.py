@@ -98,7 +98,7 @@ def colored_noise(sites: Sites, data: Data) -> list[Effect]:
         Effect(
             "colored_noise",
             {"noise_power": colour},
-            (normal("log_power", 0.3, "1", 3),),
+            (normal("log_power", 0.3, "1", 3, ("slope", "curvature", "cubic")),),
             physics="Slope, curvature and cubic shape of the log noise power over the band.",
             source="N exp(sum_n c_n P_n(x)), Legendre, n = 1..3.",
             requires=("subcarrier_frequency",),

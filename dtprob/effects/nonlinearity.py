@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.common import (
+    COMPLEX,
     Data,
     Family,
     Sites,
@@ -88,7 +89,7 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
         Effect(
             "crosstalk",
             {"noiseless_channel": lambda value, p, _: value + level * complex_of(p["leak"])},
-            (normal("leak", 0.1, "1", 2),),
+            (normal("leak", 0.1, "1", 2, COMPLEX),),
             physics="The same complex number is added to every entry; unit: the rms channel.",
             source="h + g sqrt(P), g complex (real, imaginary).",
         )
@@ -107,7 +108,7 @@ def crosstalk(sites: Sites, data: Data) -> list[Effect]:
     centre = Effect(
         "crosstalk",
         {"noiseless_channel": offset},
-        (normal("leak", 0.3, "1", 2),),
+        (normal("leak", 0.3, "1", 2, COMPLEX),),
         instance="carrier",
         physics="Leaking local oscillator: a complex number is added to the subcarrier at the carrier.",
         source="h_0 + g sqrt(P), g complex (real, imaginary).",

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dtprob.effects.common import Data, Family, Sites, along, normal, observable_basis, offers
+from dtprob.effects.common import Data, Family, Sites, along, axis_labels, normal, observable_basis, offers
 from dtprob.effects.effect import Effect, Rewrite
 from dtprob.effects.elements import DIRECTION, arrays, gain_of_field, phase_rewrite
 from dtprob.raytracing.paths import PathSet
@@ -34,7 +34,7 @@ def antenna_orientation(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "antenna_orientation",
                 rewrites,
-                (normal("rotation", 0.05, "rad", len(basis)),),
+                (normal("rotation", 0.05, "rad", len(basis), axis_labels(basis)),),
                 instance=side,
                 physics=f"The {side} array is turned about its centre, around {along(basis)}.",
                 source="r' = R r and F'(k) = R F(R^T k), R by Rodrigues from 2 tan(angle / 2) times the axis.",

@@ -186,8 +186,8 @@ class Detectable(TypedDict):
 class Candidate(TypedDict):
     """One line of the screening; an effect that a fitted parameter absorbs, or that nothing shows, has no statistic.
 
-    Of an `opposite` one the data ask for the side of its size that its prior excludes; of one with `beyond` for a size so
-    many standard deviations of its prior from the middle.
+    Of an `opposite` one the data ask for the side of its size that its prior excludes; of one with `beyond` for so many
+    times the size that its prior calls usual, its root mean square from the null.
     """
 
     effect: str

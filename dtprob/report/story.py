@@ -275,8 +275,8 @@ def _beyond(report: Report) -> str:
     if most is None or far is None or most.get("opposite"):
         return ""
     return (
-        f" Most of all the data ask for {words(most['effect'])}, but {far:.0f} standard deviations of its prior from its"
-        " middle: if it can be so large, give it a wider prior and diagnose again."
+        f" Most of all the data ask for {words(most['effect'])}, but {far:.0f} times the size that its prior calls usual:"
+        " if it can be so large, give it a wider prior and diagnose again."
     )
 
 

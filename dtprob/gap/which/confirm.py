@@ -20,7 +20,6 @@ from dtprob.gap.model.problem import Problem
 from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.inference.laplace import Laplace
 
-_DIRECTIONS = ("x", "y", "z")
 _Z90 = 1.6449
 
 
@@ -107,7 +106,7 @@ def _prefix(effect: Effect, effects: Sequence[Effect]) -> str:
 
 def _sizes(parameter: Parameter, draws: np.ndarray, prefix: str) -> list[Size]:
     flat = draws.reshape(len(draws), -1)
-    labels = [""] if flat.shape[1] == 1 else [f"_{label}" for label in _labels(parameter.shape)]
+    labels = [""] if flat.shape[1] == 1 else [f"_{label}" for label in _labels(parameter)]
     result = []
     for j, label in enumerate(labels):
         low, high = np.quantile(flat[:, j], [0.05, 0.95])
@@ -116,10 +115,8 @@ def _sizes(parameter: Parameter, draws: np.ndarray, prefix: str) -> list[Size]:
     return result
 
 
-def _labels(shape: tuple[int, ...]) -> list[str]:
-    if shape == (3,):
-        return list(_DIRECTIONS)
-    return ["_".join(map(str, index)) for index in np.ndindex(*shape)]
+def _labels(parameter: Parameter) -> Sequence[str]:
+    return parameter.labels or ["_".join(map(str, index)) for index in np.ndindex(*parameter.shape)]
 
 
 def _suffix(unit: str) -> str:

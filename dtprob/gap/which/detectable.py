@@ -16,16 +16,16 @@ _NOTICED: Final = 0.9
 
 
 class Detectable(NamedTuple):
-    """A size that would be noticed nine times in ten, and the parameter that it is of."""
+    """A size that would be noticed nine times in ten, None where none would be, and the parameter that it is of."""
 
-    size: float
+    size: float | None
     parameter: Parameter
 
 
 def detectable(
     effect: Effect, information: Float[np.ndarray, " entry"], directions: int, level: float
-) -> Detectable | None:
-    """The size, of the entry that shows most clearly at its usual size, from which on an effect is noticed; None if none.
+) -> Detectable:
+    """The size, of the entry that shows most clearly at its usual size, from which on an effect is noticed.
 
     Scores of several directions are noticed by their sum of squares, chi-square with as many degrees and of noncentrality
     size^2 J; a single one by its normal quantile, on the side that its prior allows or on either.
@@ -40,7 +40,7 @@ def detectable(
     own = information[index]
     best = int(np.argmax(own * scales(effect)[index] ** 2))
     if not own[best] > 0:
-        return None
+        return Detectable(None, _owner(effect, int(index[best])))
     needed = _needed(directions, level if is_one_sided(effect) else level / 2, level)
     return Detectable(float(np.sqrt(needed / own[best])), _owner(effect, int(index[best])))
 

@@ -55,7 +55,7 @@ class Screening:
         opposite: whether the data surely ask for a size on the side that the prior of the candidate's only one excludes.
         beyond: standard deviations of the prior of the candidate's only size to what the data alone ask for, to first order
             where they surely ask for it and it is far; None elsewhere.
-        detectable: from which size on each would be noticed nine times in ten; None of random fields and where none is.
+        detectable: from which size on each would be noticed nine times in ten; None of random fields.
         correlation: of the candidates' scores after adjustment; aliases are near +-1.
         locates: whether a candidate says how the expected observations move, not only how they spread.
         scores: of the mean effects among them.

@@ -79,12 +79,45 @@ def test_a_buffer_that_cannot_follow_is_named(tmp_path, columns):
     [
         (lambda c: c.assign(buffer_9=0), "buffer_4: expected a column, got nothing"),
         (lambda c: c.iloc[:0], "expected at least one row, got an empty table"),
-        (lambda c: changed(c, 3, action_0=2), r"action: expected 0 or 1, got 2 in row 4 "),
+        (lambda c: changed(c, 3, action_0=2), r"action_0: expected 0 or 1, got 2 in row 4 "),
     ],
 )
 def test_other_faults(tmp_path, columns, change, message):
     with pytest.raises(InputError, match=message):
         read(saved(tmp_path, change(columns)))
+
+
+def test_values_and_places_are_of_one_row_where_the_file_is_not_sorted(tmp_path):
+    rows = [(1, 0, 0), (1, 1, 7), (0, 0, 0), (0, 1, 3)]
+    columns = pd.DataFrame(rows, columns=["episode", "slot", "buffer_0"]).assign(
+        action_0=0, ack_0=0, arrival_0=0
+    )
+    message = r"buffer_0: expected 0 after the slot before, got 7 in row 2 \(episode 1, slot 1\)"
+    with pytest.raises(InputError, match=message):
+        read(saved(tmp_path, columns))
+    twice = columns.assign(buffer_0=0, slot=[5, 5, 0, 0])
+    with pytest.raises(
+        InputError, match=r"got slot 5 of episode 1 twice, again in row 2 \(episode 1, slot 5\)"
+    ):
+        read(saved(tmp_path, twice))
+
+
+@pytest.mark.parametrize("slot", [["a", "b"], [0.0, np.nan], [0.0, 0.5]])
+def test_slots_that_are_no_numbers_split_no_episode(tmp_path, slot):
+    columns = pd.DataFrame({"episode": [0, 0], "slot": slot}).assign(
+        buffer_0=0, action_0=0, ack_0=0, arrival_0=0
+    )
+    with pytest.raises(InputError, match="slot: expected integer numbers"):
+        read(saved(tmp_path, columns), {"allow_gaps": True})
+
+
+def test_columns_of_other_lengths_are_named(tmp_path, columns):
+    arrays = {name: columns[name].to_numpy() for name in columns}
+    np.savez(tmp_path / "log.npz", **{**arrays, "buffer_1": arrays["buffer_1"][:20]})
+    with pytest.raises(
+        InputError, match=r"buffer_1: expected 24 values in a row, as buffer_0 has, got shape \(20,\)"
+    ):
+        read(tmp_path / "log.npz")
 
 
 def test_an_unknown_option_is_named(tmp_path, columns):

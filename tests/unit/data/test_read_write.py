@@ -274,6 +274,10 @@ BAD_CHANNELS = {
         "tx_position: expected real numbers",
     ),
     "empty": (lambda a: {"channel": a["channel"][:0]}, "channel: expected at least one link"),
+    "one frequency": (
+        lambda a: {"subcarrier_frequency": 0 * a["subcarrier_frequency"] + 5.0},
+        r"subcarrier_frequency: expected different frequencies, got 5 Hz for all",
+    ),
 }
 
 
@@ -293,7 +297,7 @@ BAD_COLUMNS = {
     "missing column": (lambda c: {"ack_1": None}, "ack_1: expected a column, got nothing"),
     "unknown column": (lambda c: {"bufer_0": c["slot"]}, r"got 'bufer_0'\. Did you mean 'buffer_0'\?"),
     "no slot": (lambda c: {"slot": None}, "slot: expected a column"),
-    "action": (lambda c: {"action_0": c["slot"]}, "action: expected 0 or 1, got 4"),
+    "action": (lambda c: {"action_0": c["slot"]}, r"action_0: expected 0 or 1, got 2 in row 3 "),
     "slot twice": (lambda c: {"slot": c["slot"] * 0}, "slot: expected each slot of an episode once"),
     "negative": (lambda c: {"buffer_0": -1 - c["slot"]}, "buffer: expected values from 0 up, got -5"),
     "fraction": (lambda c: {"buffer_0": c["slot"] / 3}, "buffer: expected integer numbers"),
@@ -322,6 +326,20 @@ def test_bad_powers_and_labels_are_named(tmp_path):
         read(save(tmp_path / "b.npz", {"x": np.zeros(2), "y": np.full(2, np.nan)}))
     with pytest.raises(InputError, match="x: expected finite numbers, got NaN"):
         read(save(tmp_path / "c.npz", {"x": np.array([0, np.nan]), "y": np.zeros(2)}))
+
+
+def test_features_of_other_lengths_are_named(tmp_path):
+    file = save(tmp_path / "a.npz", {"x_0": np.zeros(3), "x_1": np.zeros(4), "y": np.zeros(3)})
+    with pytest.raises(InputError, match=r"x_1: expected 3 values in a row, as x_0 has, got shape \(4,\)"):
+        read(file)
+
+
+@pytest.mark.parametrize("ending", ["csv", "parquet"])
+def test_words_stay_whole_beside_an_empty_cell(tmp_path, ending):
+    frame = pd.DataFrame({"site": ["site_1", None, "site_23"], "y": [1.0, 2.0, 3.0]})
+    file = tmp_path / f"a.{ending}"
+    frame.to_csv(file, index=False) if ending == "csv" else frame.to_parquet(file)
+    assert read_table(file).arrays()["site"].tolist() == ["site_1", "", "site_23"]
 
 
 def test_bad_files_are_named(tmp_path):

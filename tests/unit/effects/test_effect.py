@@ -212,6 +212,13 @@ def test_incomplete_declarations_are_refused(changes, message):
         Effect(**{**vars(BEND), **changes})
 
 
+def test_labels_are_one_for_each_entry():
+    prior = dist.Normal(0.0, 1.0).expand([2]).to_event(1)
+    assert Parameter("gain", prior, labels=("left", "right")).labels == ("left", "right")
+    with pytest.raises(InputError, match="labels of parameter gain: expected 2, one for each entry, got 3"):
+        Parameter("gain", prior, labels=("x", "y", "z"))
+
+
 def test_context_prefers_sites_to_data():
     context = Context({"a": 1, "b": 2}, {"b": 3})
     assert dict(context) == {"a": 1, "b": 3}

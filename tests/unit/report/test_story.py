@@ -221,7 +221,7 @@ def test_a_size_that_only_its_prior_forbids_is_said() -> None:
     for z, said in ((9.3, True), (0.5, False)):  # only of what the data ask for most
         rows = [near, {**far, "effect": "body", "z": z, "beyond": 6.2}]
         action = tell({**report, "screening": rows}).action
-        assert ("ask for body, but 6 standard deviations of its prior" in action) == said
+        assert ("ask for body, but 6 times the size that its prior calls usual" in action) == said
 
 
 def test_what_cannot_be_judged_is_said_with_its_reason() -> None:

@@ -123,6 +123,8 @@ def test_the_prior_of_a_place_is_not_mixed():
         (dist.Normal(0.0, 8.0).expand([3]).to_event(1), 0.0, 8.0),
         (dist.HalfNormal(8.0), 0.0, 8.0),
         (dist.StudentT(2.0, 0.0, 4.0), 0.0, 4.0),
+        (dist.Normal(10.0, 1.0), 0.0, np.sqrt(101.0)),
+        (dist.Normal(10.0, 1.0), 10.0, 1.0),
         (dist.HalfCauchy(5.0), 0.0, 5.0),
         (dist.Exponential(0.5), 0.0, np.sqrt(8.0)),
         (dist.Uniform(20.0, 400.0), 210.0, 380.0 / np.sqrt(12.0)),
@@ -132,6 +134,10 @@ def test_the_prior_of_a_place_is_not_mixed():
 )
 def test_how_far_a_prior_puts_a_size(prior, null, scale):
     assert Parameter("p", prior, null).scale == pytest.approx(scale, rel=1e-3)
+
+
+def test_a_place_is_as_far_as_its_prior_is_wide():
+    assert Parameter("p", dist.Normal(10.0, 2.0), 0.0, is_place=True).scale == pytest.approx(2.0)
 
 
 def test_how_far_a_prior_without_moments_puts_a_size():

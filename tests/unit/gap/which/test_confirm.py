@@ -5,12 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+import pytest
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.fitting.fit import fit
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.which.confirm import confirm
+from dtprob.gap.which.confirm import _sizes, confirm
 from dtprob.inference import NUTS, Laplace
 from dtprob.models.declaration import model
 
@@ -55,3 +56,17 @@ def test_a_sampler_draws_the_accepted_fields_too():
         offset = next(size for size in sizes if size.name.startswith("offset"))
         widths.append(offset.high - offset.low)
     np.testing.assert_allclose(widths[1], widths[0], rtol=0.25)
+
+
+@pytest.mark.parametrize(
+    ("labels", "names"),
+    [
+        ((), ["gain_0_Np", "gain_1_Np", "gain_2_Np"]),
+        (("x", "y", "z"), ["gain_x_Np", "gain_y_Np", "gain_z_Np"]),
+    ],
+)
+def test_entries_are_called_as_the_parameter_says(labels, names):
+    """Three entries are three directions only where they are said to be."""
+    prior = dist.Normal(0.0, 1.0).expand([3]).to_event(1)
+    found = _sizes(Parameter("gain", prior, unit="Np", labels=labels), np.zeros((8, 3)), prefix="")
+    assert [one.name for one in found] == names

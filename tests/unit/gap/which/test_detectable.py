@@ -45,4 +45,6 @@ def test_the_size_is_of_the_parameter_that_shows_most_at_its_usual_size():
 
 
 def test_what_no_score_tells_of_is_never_noticed():
-    assert detectable(moving(Parameter("shift", dist.Normal(0.0, 1.0))), np.zeros(1), 0, LEVEL) is None
+    found = detectable(moving(Parameter("shift", dist.Normal(0.0, 1.0))), np.zeros(1), 0, LEVEL)
+    assert found.size is None
+    assert found.parameter.name == "shift"
