@@ -8,9 +8,10 @@ from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
-import numpyro.distributions as dist
 from jax import lax
 from numpyro.distributions import Distribution, constraints
+
+from dtprob.wrapping import unwrapped, wrapped
 
 
 class ComplexStudentT(Distribution):
@@ -76,14 +77,8 @@ def replace_base(fn: Any, make: Callable[[Any], Distribution]) -> Distribution:
         fn: the distribution at a sample site.
         make: gives the new innermost distribution, of the same batch and event shape, from the old one.
     """
-    if isinstance(fn, dist.Independent):
-        return replace_base(fn.base_dist, make).to_event(fn.reinterpreted_batch_ndims)
-    if isinstance(fn, dist.ExpandedDistribution):
-        return replace_base(fn.base_dist, make).expand(fn.batch_shape)
-    if isinstance(fn, dist.MaskedDistribution):
-        masked: Any = fn
-        return replace_base(fn.base_dist, make).mask(masked._mask)  # noqa: SLF001 - shown nowhere else
-    return make(fn)
+    inner, mask = unwrapped(fn)
+    return wrapped(make(inner), fn, mask)
 
 
 _SERIES = {jnp.log1p: (1.0, -1 / 2, 1 / 3, -1 / 4), jnp.expm1: (1.0, 1 / 2, 1 / 6, 1 / 24)}

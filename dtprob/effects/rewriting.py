@@ -15,6 +15,7 @@ import numpyro.distributions as dist
 from dtprob.effects.changing import Changing, is_scanned
 from dtprob.effects.effect import FIELD, Context, Effect, Model
 from dtprob.errors import InputError
+from dtprob.wrapping import unwrapped, wrapped
 
 _ADDED = "__dtprob_effects__"
 
@@ -67,7 +68,9 @@ class Rewriting(Changing):
                         "Give the data, or rewrite a deterministic site.",
                     )
                 given = self._given(effect, msg, context)
-                msg["fn"] = rewritten(effect, msg["name"], msg["fn"], given, context)
+                inner, mask = unwrapped(msg["fn"])
+                new = rewritten(effect, msg["name"], inner, given, context)
+                msg["fn"] = wrapped(new, msg["fn"], mask)
 
     def touches(self, name: str) -> bool:
         """Whether an effect rewrites a deterministic site."""
@@ -123,7 +126,7 @@ def rewritten(effect: Effect, site: str, value: Any, given: Mapping[str, Any], c
             f"{error}{own}",
             "Correct the name, or give the model what the effect needs.",
         ) from error
-    except (TypeError, ValueError) as error:
+    except (AttributeError, TypeError, ValueError) as error:
         said = next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
         raise InputError(
             f"effect {effect.name}, rewrite of site {site!r}",

@@ -22,6 +22,7 @@ from numpyro.distributions import constraints, distribution
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, model_name, select_arguments, split_static
 from dtprob.models.axes import axes_of, lent
+from dtprob.wrapping import unwrapped
 
 # ArviZ registers NumPyro to be loaded later. Where it was imported first, Python runs numpyro.distributions twice, and the
 # second copy lacks the submodule in which numpyro.factor looks.
@@ -253,7 +254,7 @@ def _with_lent_axes(sites: Mapping[str, Site]) -> dict[str, Site]:
 
 def is_factor(message: Mapping[str, Any]) -> bool:
     """Whether a site of a trace is a term that `numpyro.factor` adds to the log density."""
-    return message["type"] == "sample" and isinstance(message["fn"], numpyro.distributions.Unit)
+    return message["type"] == "sample" and isinstance(unwrapped(message["fn"])[0], numpyro.distributions.Unit)
 
 
 def _first_plate(sites: Mapping[str, Site]) -> str | None:

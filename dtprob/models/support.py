@@ -14,7 +14,7 @@ import numpyro
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, select_arguments, split_static
 from dtprob.models.declaration import NOT_TRACED, base_constraint, trace_model
-from dtprob.models.wrapping import unwrapped
+from dtprob.wrapping import unwrapped
 
 _DRAWS: Final = 8
 """Draws from the prior of which one has to allow a value: where a support ends may be unknown."""

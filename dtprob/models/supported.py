@@ -46,8 +46,17 @@ def check_supported(model: Model, data: Data) -> None:
     def run(arrays: Any, key: jax.Array) -> None:
         for name, message in trace_model(model, eqx.combine(arrays, static), key).items():
             refuse_unsupported(model, name, message)
+            _refuse_scaled(model, name, message)
 
     jax.eval_shape(run, arrays, jax.random.key(0))
+
+
+def _refuse_scaled(model: Model, name: str, message: Mapping[str, Any]) -> None:
+    """A density that counts more or less than once has other scores, and no replicates."""
+    if message["type"] == "sample" and message["scale"] is not None:
+        what, got = f"model {model_name(model)}", f"the scaled site {name!r} (numpyro.handlers.scale)"
+        remedy = "Leave the scale out, repeat the rows that count more, or fit this model without a diagnosis"
+        raise InputError(what, "sites that count once", got, remedy)
 
 
 def refuse_unsupported(model: Model, name: str, message: Mapping[str, Any]) -> None:

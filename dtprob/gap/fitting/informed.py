@@ -34,7 +34,7 @@ def informed(model: Model, known: Known) -> Model:
                 fn, value = trace[name]["fn"], trace[name]["value"]
                 transform = transform_of(fn)
                 u = transform.inv(value)
-                jacobian = fold(transform.log_abs_det_jacobian(u, value), fn.batch_shape)
+                jacobian = fold(transform.log_abs_det_jacobian(u, value), fn, value)
                 flat.append(u.reshape(-1))
                 prior = prior + jnp.sum(fn.log_prob(value) + jacobian)
             deviation = jnp.concatenate(flat) - mean

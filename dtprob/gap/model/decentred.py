@@ -23,7 +23,8 @@ from numpyro.primitives import Messenger
 
 from dtprob.effects.changing import is_scan
 from dtprob.models.arguments import Data, Model, split_static, within
-from dtprob.models.declaration import base_constraint, innermost, trace_model
+from dtprob.models.declaration import base_constraint, trace_model
+from dtprob.wrapping import unwrapped
 
 _SCALED = {"loc", "scale"}
 
@@ -72,7 +73,7 @@ def decentred(model: Model, data: Data, shared: Collection[str], own: Collection
         heavy = [n for n in own if _is_heavy(trace[n]["fn"])]
         found = {n: _way(trace[n]["fn"]) for n in (*shared, *heavy)}
         ways.update({n: way for n, way in found.items() if way is not None})
-        return {n: _spread(innermost(trace[n]["fn"])) for n in ways}
+        return {n: _spread(unwrapped(trace[n]["fn"])[0]) for n in ways}
 
     jax.eval_shape(spreads, jax.random.key(0), arrays)
     if not ways:
@@ -87,7 +88,7 @@ def decentred(model: Model, data: Data, shared: Collection[str], own: Collection
 
 def _way(fn: Any) -> Reparam | None:
     """How to draw from a distribution in standard units, where its spread is not the same always."""
-    own = innermost(fn)
+    own, _ = unwrapped(fn)
     if isinstance(own, dist.GaussianRandomWalk | dist.MultivariateNormal):
         return _Whitened() if isinstance(_spread(own), Tracer) else None
     names = set(own.arg_constraints)
@@ -100,7 +101,7 @@ def _way(fn: Any) -> Reparam | None:
 
 def _is_heavy(fn: Any) -> bool:
     """Whether a distribution is one of location and scale that is not normal, as that of levels with outliers."""
-    own = innermost(fn)
+    own, _ = unwrapped(fn)
     return set(own.arg_constraints) >= _SCALED and not isinstance(own, dist.Normal)
 
 

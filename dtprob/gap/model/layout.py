@@ -118,9 +118,9 @@ def transform_of(fn: Any) -> Any:
     return biject_to(fn.support)
 
 
-def fold(jacobian: jax.Array, batch_shape: tuple[int, ...]) -> jax.Array:
-    """Sum a log Jacobian over event dimensions."""
-    extra = jnp.ndim(jacobian) - len(batch_shape)
+def fold(jacobian: jax.Array, fn: Any, value: jax.Array) -> jax.Array:
+    """Sum a log Jacobian at a value over the event dimensions of its distribution, as the log density is."""
+    extra = jnp.ndim(jacobian) - (jnp.ndim(value) - len(fn.event_shape))
     return jnp.sum(jacobian, axis=tuple(range(-extra, 0))) if extra > 0 else jacobian
 
 

@@ -14,6 +14,7 @@ from dtprob.effects.rewriting import rewritten
 from dtprob.errors import InputError
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.rewrites import derivative, null_vector
+from dtprob.gap.observation import whiten
 
 _ROUNDING = 1e-5
 """Share of the largest value of a site that single precision may lose."""
@@ -25,11 +26,19 @@ def check_nulls(problem: Problem) -> None:
     Raises:
         InputError: one changes a site there, or makes it infinite or not a number, or has no slope there.
     """
+    for effect in problem.effects:
+        if effect.kind == "variance" and effect.distributions:
+            expected = "a random field that acts on deterministic sites, where it has scores"
+            got = f"one that rewrites the distribution of {', '.join(effect.distributions)}"
+            raise InputError(
+                f"effect {effect.name}", expected, got, "Let it rewrite a site that the model computes"
+            )
     own = [e for e in problem.effects if e.kind == "mean" and e.family not in FAMILIES]
     if not own:
         return
     centre, spread = problem.prior_middle
     values = dict(problem.compiled.sites(centre + spread))
+    observed = problem.compiled.observations(centre + spread)
     context = Context(problem.data, values)
     for effect in own:
         for site in effect.rewrites:
@@ -44,7 +53,27 @@ def check_nulls(problem: Problem) -> None:
                     f"up to {off:.3g} away from values up to {size:.3g}",
                     "Make the rewrite the identity there, or give the parameter another null",
                 )
+        for site in effect.distributions:
+            _check_density(effect, site, observed[site], problem.observed.values[site], context)
         _check_slope(effect, values, context)
+
+
+def _check_density(
+    effect: Effect, site: str, before: whiten.Observation, value: jax.Array, context: Context
+) -> None:
+    """A rewritten distribution gives the data the density that they had."""
+    fn = rewritten(effect, site, whiten.distribution(before), effect.null(), context)
+    after = whiten.rewritten(before, fn, value, site)
+    was, now = (np.asarray(whiten.log_prob(o, value)) for o in (before, after))
+    told = np.isfinite(was)
+    off = np.abs(now - was)[told].max(initial=0.0)
+    if not off <= _ROUNDING * (1 + np.abs(was[told]).max(initial=0.0)):
+        raise InputError(
+            f"effect {effect.name}",
+            f"the distribution of {site!r} unchanged at its null, {_named(effect.null())}",
+            f"log densities up to {off:.3g} away",
+            "Make the rewrite the identity there, or give the parameter another null",
+        )
 
 
 def _check_finite(effect: Effect, site: str, before: np.ndarray, after: np.ndarray) -> None:

@@ -108,7 +108,7 @@ class Runner:
                 continue
             fn, value = trace[name]["fn"], trace[name]["value"]
             jacobian = transform_of(fn).log_abs_det_jacobian(latent[name], value)
-            density = fn.log_prob(value) + fold(jacobian, fn.batch_shape)
+            density = fn.log_prob(value) + fold(jacobian, fn, value)
             if name in self.own:
                 local = local + self.own[name].summed(density)
             else:

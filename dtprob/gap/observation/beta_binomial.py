@@ -34,7 +34,12 @@ def _scores(p: Parameters, value: jax.Array) -> jax.Array:
     both = digamma(total) - digamma(n + total)
     yes = digamma(value + a) - digamma(a) + both
     no = digamma(n - value + b) - digamma(b) + both
-    return jnp.stack([mean * (1 - mean) * total * (yes - no), a * yes + b * no])
+    return _of_trials(p, jnp.stack([mean * (1 - mean) * total * (yes - no), a * yes + b * no]))
+
+
+def _of_trials(p: Parameters, rows: jax.Array) -> jax.Array:
+    """Rows (score, *value) without the rounding that is left where nothing was tried."""
+    return jnp.where(p["total_count"] > 0, rows, 0.0)
 
 
 def _counts(p: Parameters) -> tuple[jax.Array, jax.Array]:
@@ -60,13 +65,16 @@ def _information(p: Parameters) -> jax.Array:
     choices = gammaln(n + 1) - gammaln(k + 1) - gammaln(n - k + 1)
     chance = weight * jnp.exp(choices + betaln(k + a, n - k + b) - betaln(a, b))
     rows = _scores(p, k)
-    return jnp.einsum("m...,im...,jm...->...ij", chance / chance.sum(0), rows, rows)
+    told = jnp.einsum("m...,im...,jm...->...ij", chance / chance.sum(0), rows, rows)
+    return jnp.where(n[..., None, None] > 0, told, jnp.eye(2))
 
 
 def _change(p: Parameters, t: Parameters) -> jax.Array:
     mean, total, _ = _parts(p)
     more = t["concentration1"] + t["concentration0"]
-    return jnp.stack([(t["concentration1"] - mean * more) / (mean * (1 - mean) * total), more / total])
+    return _of_trials(
+        p, jnp.stack([(t["concentration1"] - mean * more) / (mean * (1 - mean) * total), more / total])
+    )
 
 
 def _to_odds(p: Parameters, step: jax.Array) -> Parameters:

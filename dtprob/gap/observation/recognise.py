@@ -14,7 +14,7 @@ from dtprob.errors import InputError
 from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, SAME, likelihood
 from dtprob.gap.observation.limited import TRUNCATED
 from dtprob.gap.observation.normal_scores import NORMAL_SCORES
-from dtprob.models.wrapping import unwrapped
+from dtprob.wrapping import unwrapped
 
 _IN_TURN: Final = "the first of all, the second of what the first leaves, and so on"
 _INSTEAD: Final = {
@@ -33,18 +33,21 @@ class _Found(NamedTuple):
     parameters: Mapping[str, Any]
 
 
-def recognised(fn: Any, value: Any, name: str) -> tuple[str, dict[str, jax.Array]]:
+def recognised(
+    fn: Any, value: Any, name: str, counted: jax.Array | None = None
+) -> tuple[str, dict[str, jax.Array]]:
     """Family and parameters of an unwrapped distribution, each broadcast to the value's shape and its further axes.
 
     Args:
         fn: the distribution.
         value: the data.
         name: of the site.
+        counted: above 0 where a value counts; None where all do.
 
     Raises:
         InputError: the diagnosis does not know the distribution.
     """
-    found = _compound(fn, value) or _plain(fn)
+    found = _compound(fn, value, counted) or _plain(fn)
     if found is None:
         raise InputError(
             f"observed site {name!r}",
@@ -84,7 +87,7 @@ def _plain(fn: Any) -> _Found | None:
     return _Found(family, {n: getattr(fn, n) for n in LIKELIHOODS[family].parameters})
 
 
-def _compound(fn: Any, value: Any) -> _Found | None:
+def _compound(fn: Any, value: Any, counted: jax.Array | None) -> _Found | None:
     """One that is made of another."""
     if isinstance(fn, (dist.MixtureSameFamily, dist.MixtureGeneral)):
         return _mixed(fn)
@@ -96,7 +99,7 @@ def _compound(fn: Any, value: Any) -> _Found | None:
     if isinstance(fn, (dist.LeftCensoredDistribution, dist.RightCensoredDistribution)):
         kind = "LeftCensored" if isinstance(fn, dist.LeftCensoredDistribution) else "RightCensored"
         censored = jnp.broadcast_to(fn.censored, jnp.shape(value))
-        return _of(kind, fn.base_dist, _limits(kind, censored, value))
+        return _of(kind, fn.base_dist, _limits(kind, censored, value, counted))
     for kind, (made, bounds) in TRUNCATED.items():
         if type(fn) is made:
             return _of(kind, fn.base_dist, {n: getattr(fn, n) for n in bounds})
@@ -136,15 +139,16 @@ def _of(kind: str, base: Any, further: Mapping[str, Any]) -> _Found | None:
     return _Found(f"{kind} {found.family}", {**found.parameters, **further})
 
 
-def _limits(kind: str, censored: jax.Array, value: Any) -> dict[str, jax.Array]:
-    """Where each reading would have been censored, and the farthest such limit of any, the same for all.
+def _limits(kind: str, censored: jax.Array, value: Any, counted: jax.Array | None) -> dict[str, jax.Array]:
+    """Where each reading would have been censored, and the farthest such limit of any that counts, the same for all.
 
     Those that were are at their limit; the others are taken to have had the farthest, if they are within it.
     """
     sign = 1.0 if kind == "LeftCensored" else -1.0
     own = sign * jnp.asarray(value, float)
     among = censored & jnp.isfinite(own)
-    farthest = jnp.where(among, own, jnp.inf).min()
+    telling = among if counted is None else among & (counted > 0)
+    farthest = jnp.where(telling, own, jnp.inf).min()
     limit = jnp.where(among, own, jnp.where(own > farthest, farthest, -jnp.inf))
     known = jnp.where(jnp.isfinite(farthest), farthest, -jnp.inf)
     return {

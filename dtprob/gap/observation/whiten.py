@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.observation.recognise import recognised
 from dtprob.gap.observation.residuals import Parameters
-from dtprob.models.wrapping import unwrapped
+from dtprob.wrapping import unwrapped
 
 
 @dataclass(frozen=True)
@@ -38,24 +38,30 @@ class Observation:
         return jnp.where(self.parameters["mask"] > 0, rows, 0.0) if "mask" in self.parameters else rows
 
 
-def observation(fn: Any, value: Any, name: str) -> Observation:
+def observation(fn: Any, value: Any, name: str, mask: Any = None) -> Observation:
     """Unwrap the distribution of an observed site.
+
+    Args:
+        fn: the distribution.
+        value: the data.
+        name: of the site.
+        mask: which entries count, instead of what the distribution says.
 
     Raises:
         InputError: the diagnosis has no whitening for the distribution.
     """
-    fn, mask = unwrapped(fn)
-    family, parameters = recognised(fn, value, name)
-    if mask is not None:
-        parameters["mask"] = jnp.broadcast_to(jnp.asarray(mask, float), jnp.shape(value))
+    fn, own = unwrapped(fn)
+    mask = own if mask is None else mask
+    counted = None if mask is None else jnp.broadcast_to(jnp.asarray(mask, float), jnp.shape(value))
+    family, parameters = recognised(fn, value, name, counted)
+    if counted is not None:
+        parameters["mask"] = counted
     return Observation(family, parameters)
 
 
 def rewritten(observed: Observation, fn: Any, value: Any, name: str) -> Observation:
     """Unwrap a distribution that was made from `distribution(observed)`, with the mask of the observation itself."""
-    new = observation(fn, value, name)
-    mask = {n: v for n, v in observed.parameters.items() if n == "mask"}
-    return Observation(new.family, {**new.parameters, **mask})
+    return observation(fn, value, name, observed.parameters.get("mask"))
 
 
 def log_prob(observed: Observation, value: jax.Array) -> jax.Array:
@@ -63,7 +69,17 @@ def log_prob(observed: Observation, value: jax.Array) -> jax.Array:
     elementwise = likelihood(observed.family).log_prob
     if elementwise is not None:
         return observed.masked(elementwise(observed.parameters, value))
-    return observed.masked(distribution(observed).log_prob(value))
+    return observed.masked(distribution(observed).log_prob(_filled(observed, value)))
+
+
+def _filled(observed: Observation, value: jax.Array) -> jax.Array:
+    """Values that can be instead of those that do not count: an infinite density has no gradient, masked or not."""
+    if "mask" not in observed.parameters:
+        return value
+    support: Any = distribution(observed).support
+    return jnp.where(
+        observed.parameters["mask"] > 0, value, jnp.asarray(support.feasible_like(value), value.dtype)
+    )
 
 
 def sample(observed: Observation, key: jax.Array) -> jax.Array:
@@ -79,7 +95,9 @@ def distribution(observed: Observation) -> Any:
 
 def residual(observed: Observation, value: jax.Array) -> jax.Array:
     """Whitened residuals, shape (component, *shape of the value): zero mean and identity covariance under the model."""
-    return observed.masked(likelihood(observed.family).residual(observed.parameters, value))
+    known = likelihood(observed.family)
+    value = value if known.log_prob is not None else _filled(observed, value)
+    return observed.masked(known.residual(observed.parameters, value))
 
 
 def shift(observed: Observation, tangent: Mapping[str, jax.Array]) -> jax.Array:

@@ -182,7 +182,7 @@ def _distribution_tangents(
             for rows in base_rows:
                 rows[site] = jnp.zeros(shape)
             continue
-        value = jnp.zeros(shape[1:])
+        value = around.problem.observed.values[site]  # of censored readings it tells the limits
 
         def parameters(flat: jax.Array, site: str = site, rewrite: Any = rewrite, value: Any = value) -> Any:
             fn = rewrite(

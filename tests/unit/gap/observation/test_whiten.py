@@ -576,3 +576,13 @@ def test_a_sharp_direction_tells_of_its_concentration_as_a_normal_does_of_its_pr
     change = {"loc": strong(0.0), "concentration": strong(1.0)}
     root = float(likelihood("VonMises").shift(parameters, change)[1])
     assert root == pytest.approx((1 + 0.25 / concentration) / (np.sqrt(2) * concentration), rel=1e-4)
+
+
+def test_a_masked_reading_tells_no_limit():
+    """The filler of a hole lies below the floor, as -999 does."""
+    value = jnp.array([-97.0, -90.0, -999.0, -95.0])
+    fn = dist.LeftCensoredDistribution(dist.Normal(-92.0, 4.0), value <= -97.0).expand([4])
+    seen = jnp.array([True, True, False, True])
+    found = whiten.observation(fn.mask(seen), value, "y")
+    np.testing.assert_allclose(found.parameters["farthest"], -97.0)
+    assert found.parameters["limit"][1] == -97.0
