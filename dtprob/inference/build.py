@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import re
 from collections import OrderedDict
 from typing import Any
 
@@ -56,19 +58,26 @@ def prior_units(target: Target, draws: np.ndarray) -> tuple[Array, Array]:
 
 
 class _TargetCache:
-    """The latest targets, by model, settings and shapes; a target goes with what was compiled for it."""
+    """The latest targets, by model, settings and shapes; a target goes with what was compiled for it.
+
+    A model that reads something else, which has changed since (a global, an attribute), is another one.
+    """
 
     def __init__(self) -> None:
-        self._kept: OrderedDict[Any, Target] = OrderedDict()
+        self._kept: OrderedDict[Any, tuple[Target, str]] = OrderedDict()
 
     def get(self, model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Target:
         signature = _signature(model, arrays, static)
-        if signature not in self._kept:
-            self._kept[signature] = _make_target(model, arrays, static)
+        target, known = self._kept.get(signature, (None, ""))
+        target = _make_target(model, arrays, static) if target is None else target
+        program = _program(model, arrays, static)
+        if known and known != program:
+            target = _make_target(model, arrays, static)
+        self._kept[signature] = target, program
         self._kept.move_to_end(signature)
         while len(self._kept) > _KEPT_TARGETS:
             self._kept.popitem(last=False)
-        return self._kept[signature]
+        return target
 
 
 _TARGETS = _TargetCache()
@@ -79,6 +88,24 @@ def _signature(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> 
     settings, settings_structure = jax.tree.flatten(static)
     shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
     return model, structure, shapes, settings_structure, tuple(settings), jax.config.jax_enable_x64
+
+
+def _program(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> str:
+    """Hash of what a run of the model computes, constants included."""
+
+    def run(arrays: dict[str, Any], key: Array) -> list[Any]:
+        trace = trace_model(model, eqx.combine(arrays, static), key)
+        samples = [site for site in trace.values() if site["type"] == "sample"]
+        densities = [site["fn"].log_prob(site["value"]) for site in samples]
+        return [*densities, *(site["value"] for site in trace.values() if site["type"] == "deterministic")]
+
+    shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), arrays)
+    closed = jax.make_jaxpr(run)(shapes, jax.random.key(0))
+    digest = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr)).encode())
+    for constant in closed.consts:
+        is_key = jnp.issubdtype(constant.dtype, jax.dtypes.prng_key)
+        digest.update(np.asarray(jax.random.key_data(constant) if is_key else constant).tobytes())
+    return digest.hexdigest()
 
 
 def _make_target(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Target:

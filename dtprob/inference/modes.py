@@ -89,10 +89,15 @@ def find_mode(
     with differentiated_forwards():
         mode: Mode = target.compiled(search, objective, max_steps)(points, inputs)
     if not bool(jnp.isfinite(mode.optimum.value)):
-        what = f"model {target.declaration.name}"
-        remedy = "Give initial values, or check that the data are finite and within the model's supports"
-        raise InputError(what, "a finite log density", "none at any start", remedy)
+        raise nowhere_finite(target)
     return mode
+
+
+def nowhere_finite(target: Target) -> InputError:
+    """The error of a model whose density is not finite where a search or a chain begins."""
+    what = f"model {target.declaration.name}"
+    remedy = "Give initial values, or check that the data are finite and within the model's supports"
+    return InputError(what, "a finite log density", "none at any start", remedy)
 
 
 def search(

@@ -30,13 +30,15 @@ from dtprob.inference.engine import AbstractEngine, RunOptions, check_key
 from dtprob.inference.enough import LOOK_EVERY, NEVER, Enough
 from dtprob.inference.identity import identity
 from dtprob.inference.kernel import Kernel
-from dtprob.inference.modes import starting_points
+from dtprob.inference.modes import nowhere_finite, starting_points
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.progress import Progress
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
 
 _EXPLORE_SHARE = 5
+_RETRIES, _ANEW = 8, 1 << 20
+"""How often chains look for another starting point where the density is not finite, and of which keys."""
 _ROWS, _ENTRIES = (
     500,
     4_000_000,
@@ -219,7 +221,7 @@ class Loop:
         path = self.options.checkpoint
         begin = self.target.once(start, self.walk)
         if not self.options.resume or path is None or not path.exists():
-            points = [self._starting_points(group) for group in keys]
+            points = self._finite(keys)
             return 0, [begin(at, group, self.inputs) for at, group in zip(points, keys, strict=True)], []
         found = checkpoint.read(path, wanted)
         if found.done > self.schedule.total:
@@ -232,6 +234,19 @@ class Loop:
         )
         chains: Chain = checkpoint.restore(found.state, like, f"checkpoint {path}")
         return found.done, self._grouped(chains), [found.draws] if found.draws else []
+
+    def _finite(self, keys: list[PRNGKeyArray]) -> list[Float[Array, "chain dimension"]]:
+        """Starting points at which the density is finite, others tried where it is not."""
+        density = self.target.compiled(_densities)
+        points = [np.asarray(self._starting_points(group)) for group in keys]
+        for number in range(_RETRIES):
+            fine = [np.isfinite(np.asarray(density(at, self.inputs))) for at in points]
+            if all(one.all() for one in fine):
+                return [jnp.asarray(at) for at in points]
+            again = [jax.vmap(jax.random.fold_in, (0, None))(group, _ANEW + number) for group in keys]
+            fresh = [np.asarray(self._starting_points(group)) for group in again]
+            points = [np.where(f[:, None], at, new) for f, at, new in zip(fine, points, fresh, strict=True)]
+        raise nowhere_finite(self.target)
 
     def _starting_points(self, keys: PRNGKeyArray) -> Float[Array, "chain dimension"]:
         """For each chain the initial values, or the best of a few prior draws."""
@@ -247,6 +262,10 @@ class Loop:
         if self.walk.own:
             return self.walk.over_chains(one, self.inputs, keys)[:, -1]
         return jnp.asarray(np.stack([np.asarray(one(self.inputs, key))[-1] for key in keys]))
+
+
+def _densities(target: Target, points: Array, inputs: Inputs) -> Float[Array, " chain"]:
+    return jax.vmap(lambda u: target.log_density(u, inputs))(points)
 
 
 def _snapshot(done: int, groups: Sequence[Chain], kept: list[dict[str, np.ndarray]]) -> checkpoint.Snapshot:

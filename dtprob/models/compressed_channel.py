@@ -118,10 +118,13 @@ def compressed_channel(
     mean = jnp.einsum("lcp,lsp->lsc", mixing, amplitude)
     noise = unknown_noise_power(noise_power, paths).reshape(-1, 1, 1)
     rank = jnp.sum(kept, axis=1)[:, None]
-    numpyro.factor("residual", -(size - rank) * jnp.log(noise[..., 0]) - residual / noise[..., 0])
+    of_link, of_snapshot = numpyro.plate("link", links, dim=-3), numpyro.plate("snapshot", snapshots, dim=-2)
+    left = -(size - rank) * jnp.log(noise[..., 0]) - residual / noise[..., 0]
+    with of_link, of_snapshot:  # where clusters are weighted it counts with them
+        numpyro.factor("residual", left[..., None])
     with (
-        numpyro.plate("link", links, dim=-3),
-        numpyro.plate("snapshot", snapshots, dim=-2),
+        of_link,
+        of_snapshot,
         numpyro.plate("component", mixing.shape[1], dim=-1),
         handlers.mask(mask=kept[:, None]),
     ):

@@ -146,7 +146,16 @@ class LogLike(Protocol):
 
 
 def transitions(episode: LogLike) -> Transition:
-    """The slots of one logged episode, each field (slot, device); nothing arrived before the first."""
+    """The slots of one logged episode, each field (slot, device); nothing arrived before the first.
+
+    Raises:
+        InputError: slots of several episodes.
+    """
+    several = len(np.unique(np.asarray(getattr(episode, "episode", 0))))
+    if several > 1:
+        raise InputError(
+            "episode", "the slots of one", f"those of {several}", "Give one episode after the other"
+        )
     arrival, ack = (jnp.asarray(x, jnp.int32) for x in (episode.arrival, episode.ack))
     last_arrival, last_ack = (jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]]) for x in (arrival, ack))
     slot = jnp.arange(len(arrival), dtype=jnp.int32)

@@ -72,12 +72,17 @@ def spread(
     influence = influence - xp.mean(influence, axis=0)
     labelled_degrees = xp.maximum(n - lost, 1.0)
     labelled = influence.T @ influence / labelled_degrees / n
+    untold = (n <= lost) & xp.eye(
+        d, dtype=bool
+    )  # a fit to as many labels as parameters leaves no error to look at
+    labelled = xp.where(untold, xp.inf, labelled)
     unlabelled_degrees = xp.maximum(count - min(lost, 1), 1.0)
     unlabelled = _unlabelled(evaluation, mix.unlabelled, inverse) / unlabelled_degrees
     variances = xp.diagonal(labelled), xp.diagonal(unlabelled)
     tiny = xp.finfo(inverse.dtype).tiny
     total = variances[0] ** 2 / labelled_degrees + variances[1] ** 2 / unlabelled_degrees
-    degrees = (variances[0] + variances[1]) ** 2 / xp.maximum(total, tiny)
+    whole = variances[0] + variances[1]
+    degrees = xp.where(xp.isfinite(whole), whole**2 / xp.maximum(total, tiny), 1.0)
     return Spread(labelled + unlabelled, xp.maximum(degrees, 1.0))
 
 

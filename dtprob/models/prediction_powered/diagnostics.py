@@ -4,6 +4,7 @@ The regions in which a predictor trained in simulation is biased on measured lab
 labels.
 """
 
+import math
 from dataclasses import dataclass
 from typing import Any, NamedTuple, final
 
@@ -197,7 +198,11 @@ def _boxes(places: np.ndarray, per_region: int) -> list[tuple[np.ndarray, _Box]]
 
 
 def _region(values: np.ndarray, box: _Box, level: float) -> Region:
-    mean, error = float(np.mean(values)), float(np.std(values, ddof=1) / np.sqrt(len(values)))
+    mean = float(np.mean(values))
+    if len(values) < 2:
+        bias = Range(mean, -math.inf, math.inf)
+        return Region(low=box[0], high=box[1], count=len(values), bias=bias, p_value=1.0)
+    error = float(np.std(values, ddof=1) / np.sqrt(len(values)))
     degrees = len(values) - 1
     half = float(stats.t.ppf((1 + level) / 2, degrees)) * error
     p_value = float(2 * stats.t.sf(abs(mean) / error, degrees)) if error > 0 else float(mean == 0)

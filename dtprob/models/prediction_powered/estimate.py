@@ -69,15 +69,17 @@ def _checked(scheme: Scheme, lam: float | None, level: float) -> Scheme:
         raise InputError("level", "a number between 0 and 1", repr(level), "Give 0.9 for 90% intervals")
     if lam is None:
         return scheme
-    if scheme.pooled:
-        raise InputError("lam", "nothing with scheme ss", repr(lam), "Use ppi or cppi")
+    if scheme.pooled or (scheme.training == "none" and lam > 0):
+        raise InputError("lam", f"nothing with scheme {scheme.name}", repr(lam), "Use ppi or cppi")
     if not 0 <= lam <= 1:
         raise InputError("lam", "a number from 0 to 1", repr(lam), "Leave it out to tune it")
     return replace(scheme, lam=lam)
 
 
 def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
-    practice, lam = problem.practice, fixed(problem.first_lambda, problem.start)
+    # what only shifts has entries that do not share residuals: each loses one degree of freedom
+    lost = 1 if problem.is_translation and problem.practice.lost is None else problem.practice.lost
+    practice, lam = replace(problem.practice, lost=lost), fixed(problem.first_lambda, problem.start)
     tells_all = problem.is_translation and problem.rounds > 0
     theta = problem.theta if tells_all else problem.solve(lam, problem.theta, problem.start)
     evaluation = problem.at(theta)

@@ -103,11 +103,15 @@ class Neighbours(JaxPredictor):
     def predict(self, learned: Any, x: Float[Array, "sample feature"]) -> Float[Array, "sample ..."]:
         """The weighted mean; the label itself at the place of a sample."""
         places, labels, weight = learned
+        # about their middle: coordinates of a map are large beside what lies between places
+        middle = weight @ places / jnp.sum(weight)
+        x, places = x - middle, places - middle
         square = jnp.sum(x**2, axis=1)[:, None] + jnp.sum(places**2, axis=1) - 2 * x @ places.T
-        square = jnp.where(weight > 0, jnp.maximum(square, 0.0), jnp.inf)
-        negative, index = jax.lax.top_k(-square, min(self.count, len(places)))
-        floor = 1e-12 * (1 + jnp.max(places**2))
-        closeness = jnp.where(jnp.isfinite(negative), (floor - negative) ** (-self.power / 2), 0.0)
+        _, index = jax.lax.top_k(-jnp.where(weight > 0, square, jnp.inf), min(self.count, len(places)))
+        away = jnp.sum((x[:, None] - places[index]) ** 2, axis=-1)
+        reach, precision = jnp.max(jnp.where(weight > 0, jnp.sum(places**2, axis=1), 0.0)), jnp.finfo(x.dtype)
+        floor = precision.eps**2 * reach + precision.tiny**0.5
+        closeness = jnp.where(weight[index] > 0, (floor + away) ** (-self.power / 2), 0.0)
         share = closeness / jnp.sum(closeness, axis=1, keepdims=True)
         return jnp.sum(share.reshape(*share.shape, *[1] * (labels.ndim - 1)) * labels[index], axis=1)
 

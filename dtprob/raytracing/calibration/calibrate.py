@@ -276,7 +276,8 @@ def _objective(settings: Settings, phasors: Phasors, statistics: Statistics) -> 
         weight = jnp.full_like(statistics.energy, 1 / jnp.sum(statistics.energy))
         mean, length = jnp.ones_like(phasors.mean), jnp.ones_like(phasors.length)
     else:
-        weight = 1 / (statistics.energy * statistics.energy.size)
+        heard = statistics.energy > 0  # a link of which nothing was received says nothing of the gains
+        weight = jnp.where(heard, 1 / jnp.where(heard, statistics.energy, 1.0), 0.0) / statistics.energy.size
         mean, length = phasors.mean, phasors.length
     linear = jnp.einsum("ls,lsp,lsp->lp", weight, jnp.conj(mean), statistics.product)
     pairs = jnp.einsum("ls,lsp,lsq->lpq", weight, jnp.conj(mean), mean) * statistics.gram

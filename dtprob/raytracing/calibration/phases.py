@@ -61,16 +61,18 @@ def concentration_of(length: Float[Array, ""]) -> Float[Array, ""]:
 
     Newton's steps from the approximation of Best and Fisher (1981).
     """
-    r = jnp.clip(length, 0.0, 1.0 - 1.0 / _LARGEST)
+    precision = jnp.finfo(jnp.result_type(length, 1.0))
+    r = jnp.clip(length, 0.0, 1.0 - max(1.0 / _LARGEST, float(precision.eps)))
     small = 2 * r + r**3 + 5 * r**5 / 6
-    large = 1 / jnp.maximum(r**3 - 4 * r**2 + 3 * r, 1e-300)
+    large = 1 / jnp.maximum(r * (1 - r) * (3 - r), precision.tiny)
+    told = min(1e4, 0.2 / float(precision.eps) ** 0.5)  # above it the slope is lost in rounding
     middle = -0.4 + 1.39 * r + 0.43 / (1 - r)
     kappa = jnp.where(r < 0.53, small, jnp.where(r < 0.85, middle, large))
     for _ in range(3):
         found = resultant(kappa)
         slope = 1 - found**2 - found / jnp.maximum(kappa, 1e-12)
-        moved = kappa - (found - r) / jnp.maximum(slope, 1e-300)
-        kappa = jnp.where((kappa > 1e-6) & (kappa < 1e4), jnp.maximum(moved, 0.0), kappa)
+        moved = kappa - (found - r) / jnp.maximum(slope, precision.tiny)
+        kappa = jnp.where((kappa > 1e-6) & (kappa < told), jnp.maximum(moved, 0.0), kappa)
     return kappa
 
 
@@ -84,7 +86,8 @@ def reference(field: Field) -> Phasors:
     """The paper's E-step: phasors by least squares as if they were free numbers, of which the directions are kept."""
     identity = jnp.eye(field.coupling.shape[-1])
     # paths that are missing, and those that nothing tells apart, make the matrix singular
-    added = jnp.where(field.snr > 0, 1e-12 * jnp.max(field.snr, axis=1, keepdims=True), 1.0)
+    ridge = max(1e-12, 10 * float(jnp.finfo(field.snr.dtype).eps))
+    added = jnp.where(field.snr > 0, ridge * jnp.max(field.snr, axis=1, keepdims=True), 1.0)
     inverse = jnp.linalg.inv(field.coupling + added[:, :, None] * identity)
     free = jnp.einsum("lpq,lsq->lsp", inverse, field.matched + 0.5 * field.concentration)
     snr = jnp.broadcast_to(field.snr[:, None], free.shape)

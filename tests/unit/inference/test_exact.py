@@ -90,3 +90,18 @@ def test_refuses_what_is_not_conjugate():
 
     with pytest.raises(InputError, match="product of powers of the tables' entries"):
         Exact()(KEY, tempered, {"y": jnp.array(1)})
+
+
+def test_a_sharp_unknown_hides_none_that_is_not_normal():
+    """4,000 readings tell `a` to 2e-4; ten outcomes of logit b leave a skew posterior, of mean 3.96."""
+
+    def model(y, c):
+        a, b = numpyro.sample("a", dist.Normal(0.0, 1.0)), numpyro.sample("b", dist.Normal(0.0, 3.0))
+        with numpyro.plate("reading", len(y)):
+            numpyro.sample("y", dist.Normal(a, 0.01), obs=y)
+        with numpyro.plate("outcome", len(c)):
+            numpyro.sample("c", dist.Bernoulli(logits=b), obs=c)
+
+    data = {"y": jnp.asarray(0.01 * np.random.default_rng(0).normal(size=4000)), "c": jnp.ones(10, int)}
+    with pytest.raises(InputError, match="a log density that is not quadratic"):
+        Exact()(KEY, model, data)

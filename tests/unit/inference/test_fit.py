@@ -1,12 +1,15 @@
 """Engines by name, with errors that name the nearest."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 
 import dtprob
 from dtprob.errors import InputError
-from dtprob.inference import ENGINES, AbstractEngine, Laplace, Point, resolve
+from dtprob.inference import ENGINES, AbstractEngine, Laplace, Point, fit, resolve
 from tests.unit.inference.examples import normal, normal_data, normal_posterior
 
 KEY = jax.random.key(0)
@@ -55,3 +58,30 @@ def test_data_are_hashed_by_value():
         for seed in (0, 0, 1)
     )
     assert first == second != third
+
+
+def test_a_model_that_reads_something_that_has_changed_is_another_one():
+    class Reading:
+        deviation = 1.0
+
+        def __call__(self, y=None):
+            level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+            with numpyro.plate("row", 50):
+                numpyro.sample("y", dist.Normal(level, self.deviation), obs=y)
+
+    model, data = Reading(), {"y": jnp.linspace(-0.1, 0.1, 50)}
+    for deviation in (1.0, 0.01):
+        model.deviation = deviation
+        found = fit(model, data, engine="laplace", key=jax.random.key(0))
+        assert float(np.std(found.draws["level"])) == pytest.approx(deviation / np.sqrt(50), rel=0.1)
+
+
+@pytest.mark.parametrize("engine", ["nuts", "blackjax_nuts"])
+def test_chains_do_not_stand_where_the_density_is_nowhere_finite(engine):
+    def model(y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+        with numpyro.plate("row", 3):
+            numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+    with pytest.raises(InputError, match="expected a finite log density, got none at any start"):
+        fit(model, {"y": jnp.array([2.9, jnp.nan, 2.0])}, engine=engine, key=jax.random.key(0))

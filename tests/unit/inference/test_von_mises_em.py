@@ -224,3 +224,16 @@ def test_other_models_are_refused(density, reason):
 def test_a_model_without_angles_is_refused():
     with pytest.raises(InputError, match="expected a latent site with circular support, got none"):
         VonMisesEM()(KEY, normal, normal_data())
+
+
+def test_a_sharp_angle_hides_none_of_another_kind():
+    def model(y, c):
+        sharp = numpyro.sample("sharp", dist.VonMises(0.0, 1.0))
+        other = numpyro.sample("other", dist.VonMises(0.0, 1.0))
+        with numpyro.plate("reading", len(y)):
+            numpyro.sample("y", dist.Normal(jnp.cos(sharp), 1e-3), obs=y)
+        numpyro.sample("c", dist.Bernoulli(logits=3 * jnp.cos(2 * other)), obs=c)
+
+    data = {"y": jnp.full(100, 0.8), "c": jnp.asarray(1)}
+    with pytest.raises(InputError, match="another dependence on 'other'"):
+        VonMisesEM()(jax.random.key(0), model, data)

@@ -7,6 +7,7 @@ import pytest
 from numpyro import handlers
 from numpyro.infer.util import log_density
 
+from dtprob import fit
 from dtprob.errors import InputError
 from dtprob.models.channel import phase_error_channel, ray_traced_channel
 from dtprob.models.compressed_channel import (
@@ -16,6 +17,7 @@ from dtprob.models.compressed_channel import (
     uniform_phase_channel,
 )
 from dtprob.raytracing.calibration import project
+from dtprob.raytracing.field import frequency_response, path_gain, synthesize
 from dtprob.testing import check_model
 from tests import small_world
 
@@ -105,3 +107,23 @@ def test_arguments_of_another_path_set_are_named(paths, statistics):
     with pytest.raises(InputError, match="powers=True"):
         compress_powers(without)
     assert jax.tree.leaves(without)
+
+
+def test_members_of_an_ensemble_weigh_what_is_left_of_a_link_too(paths):
+    """Noise that differs from link to link is as uncertain on compressed data as on the whole channel."""
+    tones = jnp.linspace(-40e6, 40e6, 16)
+    gain = path_gain(paths, paths.permittivity, paths.conductivity)
+    clean = np.asarray(synthesize(gain, frequency_response(paths, tones)))
+    random = np.random.default_rng(0)
+    power = np.mean(np.abs(clean) ** 2) / 10 * np.exp(random.normal(size=(len(clean), 1, 1, 1, 1)))
+    noise = np.sqrt(power / 2) * (random.normal(size=clean.shape) + 1j * random.normal(size=clean.shape))
+    channel = jnp.asarray(clean + noise)
+    ask = {"engine": "ensemble", "resample": "weights", "members": 48, "key": jax.random.key(0)}
+    whole = {"paths": paths, "subcarrier_frequency": tones, "channel": channel, "materials": "shared"}
+    short = {"paths": paths, "phase": "coherent", "materials": "shared"}
+    short |= compress(project(paths, tones, channel, powers=False))
+    spread = [
+        np.log(fit(model, data, **ask).flat("noise_level")).std()
+        for model, data in ((ray_traced_channel, whole), (compressed_channel, short))
+    ]
+    assert spread[1] == pytest.approx(spread[0], rel=0.05)

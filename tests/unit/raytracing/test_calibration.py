@@ -296,3 +296,25 @@ def test_groups_are_made_from_names(paths):
         object_groups(paths, [["no such wall"]])
     with pytest.raises(InputError, match="in two"):
         object_groups(paths, [[first], [first]])
+
+
+@pytest.mark.parametrize("kappa", [1e-3, 0.3, 1.0, 7.0, 60.0, 400.0, 3000.0])
+def test_concentration_in_single_precision(kappa):
+    """The resultant of 3,000 is told to a fifth only by single precision; near 1 nothing is lost beside that."""
+    with jax.enable_x64(False):
+        found = phases.concentration_of(phases.resultant(jnp.asarray(kappa, jnp.float32)))
+        assert found.dtype == jnp.float32
+        assert np.isfinite(float(phases.concentration_of(jnp.asarray(1.0, jnp.float32))))
+    assert float(found) == pytest.approx(kappa, rel=max(2e-3, 1e-4 * kappa))
+
+
+def test_a_link_without_signal_spoils_no_calibration(paths, array):
+    tones = jnp.linspace(-50e6, 50e6, 8)
+    gain = path_gain(paths, paths.permittivity, paths.conductivity, law="half_space")
+    channel = np.array(synthesize(gain, frequency_response(paths, tones)))
+    power = float(np.mean(np.abs(channel) ** 2)) / 100
+    channel[1] = 0.0
+    heard = project(paths, tones, jnp.asarray(channel), powers=False)
+    found = calibrate(paths, heard, power, settings=Settings("aware", iterations=20, law="half_space"))
+    assert np.isfinite(found.permittivity).all()
+    assert np.isfinite(found.loss).all()

@@ -111,3 +111,8 @@ def test_transitions_carry_the_slot_before(log):
     happened = transitions(log)
     assert np.array_equal(happened.state.ack[1:], log.ack[:-1])
     assert not np.any(np.asarray(happened.state.arrival[0]))
+
+
+def test_several_episodes_are_not_taken_for_one(posterior):
+    with pytest.raises(InputError, match="episode: expected the slots of one, got those of 2"):
+        what_if(jax.random.key(0), SYSTEM, posterior, simulate(12, 3, episodes=2), draws=3)

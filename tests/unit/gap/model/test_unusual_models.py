@@ -59,7 +59,10 @@ def noisy(time, seen, y=None):
 SLOPE = (Parameter("b", dist.Normal(0.0, 2.0)),)
 OF_MEAN = Effect("tilt", {"mean": lambda v, p, c: v + p["b"] * c["time"]}, SLOPE)
 OF_LAW = Effect(
-    "tilt", {}, SLOPE, distributions={"y": lambda fn, p, c: dist.Normal(fn.loc + p["b"] * c["time"], fn.scale)}
+    "tilt",
+    {},
+    SLOPE,
+    distributions={"y": lambda fn, p, c: dist.Normal(fn.loc + p["b"] * c["time"], fn.scale)},
 )
 
 
@@ -86,7 +89,9 @@ def test_an_effect_on_a_law_that_changes_it_at_its_null_is_refused():
     check_nulls(Problem(noisy, masked_data(500.0), [OF_LAW]))
     law = {"y": lambda fn, p, c: dist.Normal(fn.loc + 1.0 + p["b"], fn.scale)}
     moved = Effect("moved", {}, SLOPE, distributions=law)
-    with pytest.raises(InputError, match="effect moved: expected the distribution of 'y' unchanged at its null"):
+    with pytest.raises(
+        InputError, match="effect moved: expected the distribution of 'y' unchanged at its null"
+    ):
         check_nulls(Problem(noisy, masked_data(500.0), [moved]))
 
 
@@ -99,7 +104,9 @@ def test_a_random_field_on_a_law_alone_is_refused():
         field_shape=lambda _, __: (ROWS,),
         distributions={"y": lambda fn, p, c: dist.Normal(fn.loc + p["scale"] * p[FIELD], fn.scale)},
     )
-    with pytest.raises(InputError, match="effect field: expected a random field that acts on deterministic sites"):
+    with pytest.raises(
+        InputError, match="effect field: expected a random field that acts on deterministic sites"
+    ):
         check_nulls(Problem(noisy, masked_data(0.0), [field]))
 
 

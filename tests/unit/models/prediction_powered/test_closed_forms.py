@@ -162,3 +162,19 @@ def test_without_unlabelled_samples_it_is_erm_and_says_so():
 
 def test_semi_supervised_warns_of_its_bias():
     assert estimate("mean", scalar(), "ss").notes == (BIASED,)
+
+
+@pytest.mark.parametrize("entries", [1, 5, 20])
+def test_the_error_of_a_mean_does_not_depend_on_other_entries(entries):
+    y = np.random.default_rng(4).normal(size=(30, entries))
+    found = estimate("mean", Sample(y=y), "erm")
+    assert np.atleast_1d(found.standard_error)[0] == pytest.approx(y[:, 0].std(ddof=1) / np.sqrt(30))
+
+
+def test_as_many_labels_as_parameters_leave_no_interval():
+    one = estimate("mean", Sample(y=np.array([1.0])), "erm")
+    assert np.isinf([one.low, one.high]).all()
+    x = np.array([[1.0, 0.3], [1.0, -0.4]])
+    both = estimate("ols", Sample(x=x, y=np.array([1.0, 2.0])), "erm")
+    assert np.isinf([both.low, both.high]).all()
+    np.testing.assert_allclose(x @ both.theta, [1.0, 2.0])

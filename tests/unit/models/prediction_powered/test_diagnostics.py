@@ -60,3 +60,10 @@ def test_a_moved_feature_is_named():
     found = bias_map(mapped(moved=0.6))
     assert found.shifted_feature == 1
     assert found.shift_p_value < 1e-6
+
+
+def test_one_label_in_a_region_proves_nothing():
+    sample = Sample(y=np.array([1.0]), prediction=np.array([0.9]), x=np.zeros((1, 1)))
+    (region,) = bias_map(sample, per_region=1).regions
+    assert region.p_value == 1.0
+    assert np.isinf(region.bias.high)

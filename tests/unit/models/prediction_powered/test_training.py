@@ -3,6 +3,7 @@
 import equinox as eqx
 import flax.linen as nn
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from sklearn.linear_model import LinearRegression, LogisticRegression
@@ -111,3 +112,12 @@ def test_from_data_to_estimate_beats_labels_alone():
     )
     assert np.all(tuned.standard_error < 0.7 * alone.standard_error)
     assert np.all(np.abs(tuned.theta - [1.0, 1.0]) < 4 * tuned.standard_error)
+
+
+@pytest.mark.parametrize("offset", [0.0, 5e6])
+def test_neighbours_do_not_depend_on_the_origin(offset):
+    """Labels at the samples' own places, on coordinates of a map, too."""
+    rng = np.random.default_rng(0)
+    places, labels = jnp.asarray(rng.uniform(0, 50, (200, 2)) + offset), jnp.arange(200.0)
+    learned = Neighbours(3).train(KEY, places, labels, jnp.ones(200))
+    np.testing.assert_allclose(Neighbours(3).predict(learned, places), labels, atol=1e-6)
