@@ -86,6 +86,8 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
         """
         if self._state is None or (not self.agents and actions):
             raise InputError("step", "an episode under way", "none", "Call reset first")
+        if not self.agents:
+            return {}, {}, {}, {}, {}
         missing = [agent for agent in self.agents if agent not in actions]
         if missing:
             remedy = "Give an action for every device"

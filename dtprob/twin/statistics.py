@@ -17,8 +17,12 @@ from dtprob.errors import InputError
 
 
 def disagreement(likelihood: Float[np.ndarray, "draw window"]) -> Float[np.ndarray, " window"]:
-    """Standard deviation of the log likelihood over draws, nats; large where the ensemble disagrees."""
-    return np.std(likelihood, axis=0)
+    """Standard deviation of the log likelihood over draws, nats; large where the ensemble disagrees.
+
+    It has no bound where a draw says that the window cannot be.
+    """
+    can_be = np.all(likelihood > -np.inf, axis=0)
+    return np.where(can_be, np.std(np.where(can_be, likelihood, 0.0), axis=0), np.inf)
 
 
 def log_predictive(likelihood: Float[np.ndarray, "draw window"]) -> Float[np.ndarray, " window"]:
@@ -40,9 +44,11 @@ def log_evidence(
 
     Args:
         changed: likelihoods under draws of what a change may bring, such as the prior.
-        normal: likelihoods under draws of the posterior.
+        normal: likelihoods under draws of the posterior. A window that cannot be under any of them is a change for sure.
     """
-    return log_predictive(changed) - log_predictive(normal)
+    learned = log_predictive(normal)
+    can_be = learned > -np.inf
+    return np.where(can_be, log_predictive(changed) - np.where(can_be, learned, 0.0), np.inf)
 
 
 def threshold(normal: Float[np.ndarray, " window"], rate: float) -> float:

@@ -117,3 +117,4 @@ def test_pettingzoo_truncates_and_shows_the_final_observation():
         assert len(set(reward.values())) == 1
         assert np.array_equal(network.state(), np.stack(list(seen.values())))
     assert network.agents == []
+    assert network.step({}) == ({}, {}, {}, {}, {})

@@ -73,3 +73,17 @@ def test_likelihood_of_counts_with_what_cannot_happen():
     counts = np.array([[2.0, 0.0], [1.0, 1.0]])
     found = table_likelihoods({"t": counts}, {"t": tables})["t"]
     np.testing.assert_allclose(found, [[np.log(0.25), np.log(0.25)], [0.0, -np.inf]])
+
+
+def test_windows_that_cannot_be_are_changes():
+    """Two draws allow the first window, one the second, none the third."""
+    learned = np.log(
+        np.array([[0.2, 0.1, 0.0], [0.4, 0.0, 0.0]]),
+        where=[[1, 1, 0], [1, 0, 0]],
+        out=np.full((2, 3), -np.inf),
+    )
+    np.testing.assert_allclose(statistics.disagreement(learned), [np.log(2) / 2, np.inf, np.inf])
+    changed = np.log(np.full((2, 3), 0.15))
+    np.testing.assert_allclose(statistics.log_evidence(changed, learned), [np.log(0.5), np.log(3), np.inf])
+    nothing = np.full((2, 3), -np.inf)
+    np.testing.assert_array_equal(statistics.log_evidence(nothing, learned), [-np.inf, -np.inf, np.inf])
