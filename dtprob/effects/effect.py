@@ -146,7 +146,8 @@ class Effect:
         source: where the formula comes from.
         requires: names of data or sites that the rewrites look up in the context.
         distributions: for each sampled site (an observation, mostly), the function (distribution, parameters,
-            context) -> new distribution of the same batch and event shape.
+            context) -> new distribution of the same shape. It is given what lies within plates, events and masks,
+            which the new one keeps.
         field_shape: shape of the field of a "variance" effect from the value of its first site and the
             context; by default that of the value, to be given where a distribution is rewritten. The leading
             axes are the site's (full size, or 1 where the field is shared along the axis), further axes are free.
