@@ -17,6 +17,7 @@ from dtprob.gap.fitting.density import terms_of
 from dtprob.gap.fitting.fit import fit
 from dtprob.gap.model.nulls import check_nulls
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.which.directions import surroundings, tangents
 
 ROWS = 24
 TIME = np.linspace(-1.0, 1.0, ROWS)
@@ -191,3 +192,28 @@ def test_a_count_of_no_trials_says_nothing():
     rows = np.asarray(whole.compiled.residual(np.zeros(1)))
     assert np.isfinite(rows).all()
     assert not rows[~tried].any()
+
+
+def test_an_effect_on_a_censored_law_is_told_as_much_as_one_on_its_site():
+    """Where readings are censored is told by the readings, not by an effect."""
+
+    def model(time, censored, y=None):
+        level = numpyro.sample("level", dist.Normal(-95.0, 5.0))
+        mean = numpyro.deterministic("mean", level + 0 * time)
+        with numpyro.plate("row", ROWS):
+            numpyro.sample("y", dist.LeftCensoredDistribution(dist.Normal(mean, 3.0), censored), obs=y)
+
+    def steeper(fn, p, c):
+        base = fn.base_dist
+        return dist.LeftCensoredDistribution(
+            dist.Normal(base.loc + p["b"] * c["time"], base.scale), fn.censored
+        )
+
+    of_law = Effect("law", {}, SLOPE, distributions={"y": steeper})
+    raw = -95 + 3 * np.random.default_rng(4).normal(size=ROWS)
+    data = {"time": TIME, "censored": raw <= -97.0, "y": np.maximum(raw, -97.0)}
+    problem = Problem(model, {n: jnp.asarray(v) for n, v in data.items()}, [OF_MEAN, of_law])
+    found = tangents(surroundings(problem, np.array([-95.0])), [OF_MEAN, of_law], problem.programs)
+    information = np.einsum("cmi,cmi->i", found.columns, found.columns)
+    assert information[0] > 0.5
+    assert information[1] == pytest.approx(information[0], rel=1e-6)
