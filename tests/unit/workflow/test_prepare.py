@@ -110,10 +110,10 @@ def test_options_and_phase_reach_the_model(folder):
     assert (data["materials"], data["phase"]) == ("shared", "per_packet")
 
 
-def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
+def tracing(folder, monkeypatch):
+    """The scenes that are traced, all of which have the paths of the folder."""
     from dtprob.workflow import scene
 
-    change(folder, 'file = "paths.nc"', 'file = "simple_street_canyon"')
     traced = []
 
     def fake_trace(section, data):
@@ -121,6 +121,12 @@ def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
         return storage.load(folder / "paths.nc")
 
     monkeypatch.setattr(scene, "_trace", fake_trace)
+    return traced
+
+
+def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
+    change(folder, 'file = "paths.nc"', 'file = "simple_street_canyon"')
+    traced = tracing(folder, monkeypatch)
     case = load_case(folder / "case.toml")
     first = prepare(case, need="fit", cache=folder / "out")
     second = prepare(case, need="fit", cache=folder / "out")
@@ -132,8 +138,6 @@ def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
 
 
 def test_a_scene_whose_mesh_has_changed_is_traced_again(folder, monkeypatch):
-    from dtprob.workflow import scene
-
     change(folder, 'file = "paths.nc"', 'file = "street.xml"')
     mesh = folder / "meshes" / "house.ply"
     mesh.parent.mkdir()
@@ -141,13 +145,7 @@ def test_a_scene_whose_mesh_has_changed_is_traced_again(folder, monkeypatch):
     (folder / "street.xml").write_text(
         '<scene version="2.1.0"><shape type="ply"><string name="filename" value="meshes/house.ply"/></shape></scene>'
     )
-    traced, said = [], []
-
-    def fake_trace(section, data):
-        traced.append(section.file)
-        return storage.load(folder / "paths.nc")
-
-    monkeypatch.setattr(scene, "_trace", fake_trace)
+    traced, said = tracing(folder, monkeypatch), []
     case = load_case(folder / "case.toml")
     first = prepare(case, need="fit", cache=folder / "out")
     assert (
