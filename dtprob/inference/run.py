@@ -237,7 +237,7 @@ class Loop:
 
     def _finite(self, keys: list[PRNGKeyArray]) -> list[Float[Array, "chain dimension"]]:
         """Starting points at which the density is finite, others tried where it is not."""
-        density = self.target.compiled(_densities)
+        density = self.target.once(_densities, self.walk)
         points = [np.asarray(self._starting_points(group)) for group in keys]
         for number in range(_RETRIES):
             fine = [np.isfinite(np.asarray(density(at, self.inputs))) for at in points]
@@ -264,8 +264,8 @@ class Loop:
         return jnp.asarray(np.stack([np.asarray(one(self.inputs, key))[-1] for key in keys]))
 
 
-def _densities(target: Target, points: Array, inputs: Inputs) -> Float[Array, " chain"]:
-    return jax.vmap(lambda u: target.log_density(u, inputs))(points)
+def _densities(target: Target, walk: Walk, points: Array, inputs: Inputs) -> Float[Array, " chain"]:
+    return walk.over_chains(lambda own, u: target.log_density(u, own), inputs, points)
 
 
 def _snapshot(done: int, groups: Sequence[Chain], kept: list[dict[str, np.ndarray]]) -> checkpoint.Snapshot:

@@ -205,7 +205,9 @@ def test_one_compilation_for_each_shape():
         fits.append(Laplace(draws=10)(KEY, model, data))
         fits[-1] = (len(calls), float(fits[-1].draws["weight"].mean()))
     traced, answers = zip(*fits, strict=True)
-    assert traced[0] == traced[1] == traced[2] < traced[3]
+    runs = np.diff([0, *traced])  # one is a look whether what the model computes has changed
+    assert runs[1] == runs[2] == 1
+    assert runs[3] > 1
     assert len(set(answers)) == 4
 
 
