@@ -46,10 +46,12 @@ def source_files(names: Iterable[str], folder: Path) -> list[Path]:
     """
     named, own = {name.partition(":")[0] for name in names}, folder.resolve()
     files: set[Path] = set()
+    if not named:
+        return []
     for name, module in list(sys.modules.items()):
         file = Path(getattr(module, "__file__", None) or "").resolve()
         is_beside = file.is_relative_to(own) and not file.is_relative_to(sys.prefix)
-        if file.is_file() and (name in named or (named and is_beside)):
+        if file.is_file() and (name in named or is_beside):
             files.add(file)
     return sorted(files)
 

@@ -23,8 +23,6 @@ type Family = Callable[[Sites, Data], Sequence[Effect]]
 
 SIDES: Final = ("rx", "tx")
 """The two ends of a link."""
-
-
 DIRECTIONS: Final = ("x", "y", "z")
 """Of the world's axes."""
 COMPLEX: Final = ("real", "imaginary")

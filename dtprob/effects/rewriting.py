@@ -13,9 +13,9 @@ import numpyro
 import numpyro.distributions as dist
 
 from dtprob.effects.changing import Changing, is_scanned
+from dtprob.effects.distributions import replace_base
 from dtprob.effects.effect import FIELD, Context, Effect, Model
 from dtprob.errors import InputError
-from dtprob.wrapping import unwrapped, wrapped
 
 _ADDED = "__dtprob_effects__"
 
@@ -68,9 +68,8 @@ class Rewriting(Changing):
                         "Give the data, or rewrite a deterministic site.",
                     )
                 given = self._given(effect, msg, context)
-                inner, mask = unwrapped(msg["fn"])
-                new = rewritten(effect, msg["name"], inner, given, context)
-                msg["fn"] = wrapped(new, msg["fn"], mask)
+                change = functools.partial(_changed, effect, msg["name"], given, context)
+                msg["fn"] = replace_base(msg["fn"], change)
 
     def touches(self, name: str) -> bool:
         """Whether an effect rewrites a deterministic site."""
@@ -103,6 +102,10 @@ class Rewriting(Changing):
             drawn = numpyro.sample(name, normal, infer={"block_plates": plates})
             self._fields[effect.name] = jnp.asarray(drawn)
         return {**given, FIELD: self._fields[effect.name]}
+
+
+def _changed(effect: Effect, site: str, given: Mapping[str, Any], context: Context, fn: Any) -> Any:
+    return rewritten(effect, site, fn, given, context)
 
 
 def rewritten(effect: Effect, site: str, value: Any, given: Mapping[str, Any], context: Context) -> Any:

@@ -21,8 +21,6 @@ INTERACTIONS: Final = {
     REFRACTION: "refraction",
     DIFFRACTION: "diffraction",
 }
-
-
 _STRAIGHT: Final = 1 - 1e-6
 """Cosine of the angle between departure and arrival from which on a path is straight."""
 

@@ -53,7 +53,7 @@ class Screening:
         step: one-step estimate of each mean effect's parameters, flat.
         absorbed_by: the nuisance that hides the candidate, if one does.
         opposite: whether the data surely ask for a size on the side that the prior of the candidate's only one excludes.
-        beyond: standard deviations of the prior of the candidate's only size to what the data alone ask for, to first order
+        beyond: what the data alone ask for over what the prior of the candidate's only size calls usual, to first order
             where they surely ask for it and it is far; None elsewhere.
         detectable: from which size on each would be noticed nine times in ten; None of random fields.
         correlation: of the candidates' scores after adjustment; aliases are near +-1.
