@@ -133,7 +133,7 @@ def test_sample_shape_counts_each_jacobian_once():
             numpyro.sample("y", dist.Normal(mean, 0.5), obs=y)
 
     y = jnp.asarray(np.random.default_rng(2).uniform(0.2, 1.0, ROWS))
-    at = np.array([0.3, -0.4, 0.1])
+    at = np.array([0.3, -0.4, 0.7])
     found = [log_posterior(Problem(model, {"how": how, "y": y}, []), at) for how in (True, False)]
     own = -potential_energy(model, (True,), {"y": y}, {"spread": jnp.asarray(at)})
     np.testing.assert_allclose(found, float(own), rtol=1e-9)
