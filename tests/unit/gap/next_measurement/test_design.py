@@ -131,6 +131,19 @@ def test_a_plan_does_not_hide_repeats():
     assert recommend([one], most=2000).repeats == 1500
 
 
+def test_a_place_is_in_a_plan_once():
+    """Eight repeats of two places bring 2.8 nats; the second place twice would bring four, and is not told so."""
+    none = np.zeros((1, 0)), np.zeros((0, 0))
+    designs = [
+        Design({"row": k}, 1.0, tuple(Prediction(np.array([m]), *none) for m in (0.0, np.sqrt(2 * nats))))
+        for k, nats in enumerate((0.2, 0.15))
+    ]
+    found = recommend(designs, most=8)
+    assert found.where == {"row": [0, 1]}
+    assert found.nats == pytest.approx(2.8)
+    assert not found.resolves
+
+
 def test_a_plan_is_of_one_set_of_designs():
     """A level and a slope need two places; those of two sets are not told under one name."""
     level = np.ones((1, 1)), np.full((1, 1), 25.0)

@@ -114,7 +114,7 @@ def test_from_data_to_estimate_beats_labels_alone():
     assert np.all(np.abs(tuned.theta - [1.0, 1.0]) < 4 * tuned.standard_error)
 
 
-@pytest.mark.parametrize("offset", [0.0, 5e6])
+@pytest.mark.parametrize("offset", [0.0, 5e6, 5e8])
 def test_neighbours_do_not_depend_on_the_origin(offset):
     """Labels at the samples' own places, on coordinates of a map, too."""
     rng = np.random.default_rng(0)
