@@ -183,17 +183,15 @@ def _place(world: World, scene: Any) -> None:
 def _links(scene: Any, world: World) -> _Found:
     """The paths of all links, those of one transmitter after the other."""
     sources, which = np.unique(world.tx_position, axis=0, return_inverse=True)
-    groups = [
-        (links, found)
-        for number, source in enumerate(sources)
-        for links, found in in_groups(
-            lambda some, source=source: _solve(scene, world, source, world.rx_position[some]),
-            np.flatnonzero(which.reshape(-1) == number),
+    groups = list(
+        in_groups(
+            lambda number, some: _solve(scene, world, sources[number], world.rx_position[some]),
+            [np.flatnonzero(which.reshape(-1) == number) for number in range(len(sources))],
             depth=world.max_depth,
             samples=world.rays,
             max_paths=MAX_PATHS,
         )
-    ]
+    )
     paths = max(found.mask.shape[1] for _, found in groups)
     depth = max(found.steps.shape[2] for _, found in groups)
     order = np.argsort(np.concatenate([links for links, _ in groups]))

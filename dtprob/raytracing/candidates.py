@@ -7,7 +7,7 @@ that would fill it are searched in smaller groups, and what still does not fit i
 """
 
 import warnings
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
 from typing import Any, Final
 
@@ -22,6 +22,9 @@ _CROWDED: Final = TABLE // 500
 
 _LOSING: Final = TABLE // 100
 """Candidates of a single target from which on the loss is said."""
+
+_SPARE: Final = 0.8
+"""Share of the room that the next group is expected to take: some targets have more candidates than others."""
 
 _LANES: Final = 30_000_000
 """Rays times depth times targets that one call of the solver may hold, about 1 GB."""
@@ -61,8 +64,8 @@ def large_table() -> Generator[None]:
 
 
 def in_groups[T](
-    search: Callable[[Int[np.ndarray, " some"]], tuple[T, int]],
-    targets: Int[np.ndarray, " target"],
+    search: Callable[[int, Int[np.ndarray, " some"]], tuple[T, int]],
+    targets: Sequence[Int[np.ndarray, " target"]],
     *,
     depth: int,
     samples: int,
@@ -70,9 +73,11 @@ def in_groups[T](
 ) -> Generator[tuple[Int[np.ndarray, " some"], T]]:
     """Search the paths to many targets, so few at a time that no candidates are dropped. Warns where one is too many.
 
+    How many go together follows from the most candidates that a target has had so far.
+
     Args:
-        search: what finds the paths to some targets of one source, and how many candidates there were.
-        targets: numbers of the targets.
+        search: what finds the paths from the source of a number to some targets, and how many candidates there were.
+        targets: numbers of the targets of each source.
         depth: most interactions on a path.
         samples: rays shot from the source.
         max_paths: room for candidates in a call of `search`.
@@ -80,17 +85,21 @@ def in_groups[T](
     Yields:
         the targets of a group and what was found for them, in order.
     """
-    size = max(1, _LANES // (max(depth, 1) * samples))
-    waiting = [targets[start : start + size] for start in range(0, len(targets), size)][::-1]
-    while waiting:
-        group = waiting.pop()
-        found, candidates = search(group)
-        if candidates >= min(max_paths - 1, _CROWDED) and len(group) > 1:
-            parts = min(len(group), 1 + 2 * candidates // min(max_paths, _CROWDED))
-            waiting += np.array_split(group, parts)[::-1]
-            continue
-        _warn(candidates, max_paths)
-        yield group, found
+    most, room = max(1, _LANES // (max(depth, 1) * samples)), max(min(max_paths - 1, _CROWDED), 1)
+    expected = seen = _SPARE * room / most
+    for source, all_ in enumerate(targets):
+        start = 0
+        while start < len(all_):
+            group = all_[start : start + max(int(_SPARE * room / expected), 1)]
+            found, candidates = search(source, group)
+            each = candidates / len(group)
+            if candidates >= room and len(group) > 1:
+                expected = 2 * each if candidates >= max_paths - 1 else each  # not all were counted
+                continue
+            _warn(candidates, max_paths)
+            expected = seen = max(seen, each)
+            start += len(group)
+            yield group, found
 
 
 def _warn(candidates: int, max_paths: int) -> None:

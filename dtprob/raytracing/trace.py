@@ -1,7 +1,6 @@
 """Trace the paths of many links through a scene, once, into a `PathSet`."""
 
 import os
-from collections.abc import Generator
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -175,28 +174,26 @@ def _trace_links(
     """Trace from the side with fewer distinct places, and turn the paths round if that is the receivers."""
     turned = len(np.unique(rx, axis=0)) < len(np.unique(tx, axis=0))
     source, target = (rx, tx) if turned else (tx, rx)
-    found = [
-        group
-        for place, links in _groups(source)
-        for group in in_groups(
-            lambda some, place=place: solve(scene, place, target[some], settings),
+    places, links = _groups(source)
+    found = list(
+        in_groups(
+            lambda number, some: solve(scene, places[number], target[some], settings),
             links,
             depth=settings.max_depth,
             samples=settings.samples,
             max_paths=settings.max_paths,
         )
-    ]
+    )
     flat = _join(found, settings.max_depth)
     return flat.turned() if turned else flat
 
 
 def _groups(
     source: Float[np.ndarray, "link 3"],
-) -> Generator[tuple[Float[np.ndarray, "3"], Int[np.ndarray, " group"]]]:
-    """Each distinct source with its links."""
+) -> tuple[Float[np.ndarray, "place 3"], list[Int[np.ndarray, " group"]]]:
+    """Each distinct source, and its links."""
     places, which = np.unique(source, axis=0, return_inverse=True)
-    for number, place in enumerate(places):
-        yield place, np.flatnonzero(which.reshape(-1) == number)
+    return places, [np.flatnonzero(which.reshape(-1) == number) for number in range(len(places))]
 
 
 def _join(found: list[tuple[Int[np.ndarray, " group"], Traced]], max_depth: int) -> Flat:

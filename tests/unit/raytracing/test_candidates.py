@@ -16,12 +16,13 @@ def searched(each, **room):
     """The groups that a search ends with, when a target has so many candidates; and the sizes of all it tried."""
     tried = []
 
-    def search(some):
-        tried.append(len(some))
-        return some + 1000, each * len(some)
-
     settings = {"depth": 3, "samples": 1000, "max_paths": 10_000} | room
-    return list(in_groups(search, TARGETS, **settings)), tried
+
+    def search(_, some):
+        tried.append(len(some))
+        return some + 1000, min(each * len(some), settings["max_paths"])
+
+    return list(in_groups(search, [TARGETS], **settings)), tried
 
 
 @pytest.mark.parametrize("each", [1, 300, 1000, 6000])
@@ -33,6 +34,20 @@ def test_groups_shrink_until_they_fit(each):
     assert all(np.array_equal(found, some + 1000) for some, found in groups)
     assert all(each * len(some) < 10_000 for some, _ in groups)
     assert sum(tried) <= 3 * len(TARGETS)
+
+
+def test_later_sources_know_what_the_first_one_found():
+    tried = []
+
+    def search(source, some):
+        tried.append((source, len(some)))
+        return None, 3000 * len(some)
+
+    groups = list(in_groups(search, [TARGETS, TARGETS[:7]], depth=3, samples=1000, max_paths=10_000))
+    assert np.array_equal(np.concatenate([some for some, _ in groups]), [*TARGETS, *TARGETS[:7]])
+    assert tried[0] == (0, 50)
+    assert all(size <= 3 for _, size in tried[4:])
+    assert [size for source, size in tried if source == 1] == [2, 2, 2, 1]
 
 
 def test_groups_follow_from_rays_and_depth():
