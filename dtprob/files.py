@@ -1,5 +1,6 @@
 """Files that are either there whole or not at all."""
 
+import hashlib
 import os
 import secrets
 from collections.abc import Generator
@@ -37,6 +38,19 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write text to a file, whole or not at all."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def sha256(path: Path) -> str:
+    """Hash of a file, or of all files of a folder by name, compiled modules left out."""
+    digest = hashlib.sha256()
+    if not path.is_dir():
+        digest.update(path.read_bytes())
+        return digest.hexdigest()
+    for file in sorted(entry for entry in path.rglob("*") if entry.is_file()):
+        if "__pycache__" not in file.parts:
+            digest.update(str(file.relative_to(path)).encode())
+            digest.update(file.read_bytes())
+    return digest.hexdigest()
 
 
 def _flush(path: Path) -> None:

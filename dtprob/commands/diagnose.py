@@ -10,9 +10,9 @@ from typing import Any
 import jax
 from xarray import DataTree
 
-from dtprob import __version__
 from dtprob.case import Case
 from dtprob.commands.run import Run, chosen, infer, prepare_case, session
+from dtprob.edition import edition
 from dtprob.files import atomic_write, write_text
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.model.problem import Problem
@@ -108,7 +108,7 @@ def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tupl
         say=job.say,
     )
     report = diagnosis.to_report()
-    provenance = {**report.get("provenance", {}), "dtprob": __version__, **prepared.provenance}
+    provenance = {**report.get("provenance", {}), "dtprob": edition(), **prepared.provenance}
     return {**report, "provenance": provenance}, diagnosis.to_datatree()
 
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import jax
 
-from dtprob import __version__
 from dtprob.commands.run import session
+from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
 from dtprob.reproduce import FIGURES
 from dtprob.reproduce.figure import write
@@ -36,9 +36,13 @@ def run(figure: str, out: Path, *, runs: int | None, seed: int, resume: bool) ->
     with session() as say:
         module = importlib.import_module(FIGURES[figure])
         count = module.RUNS if runs is None else runs
-        parts = out / f".{figure}-{count}-{seed}-{__version__}"
+        kept = f".{figure}-{count}-{seed}-"
+        parts = out / f"{kept}{edition()}"
+        others = [folder for folder in out.glob(f"{kept}*") if folder != parts]
         if not resume:
             shutil.rmtree(parts, ignore_errors=True)
+        elif others and not parts.is_dir():
+            say(f"beginning anew: what lies in {others[0].name} is by another state of dtprob")
         progress = Progress(say, parts)
         start = time.monotonic() - progress.spent()
         made = module.run(jax.random.key(seed), count, progress)

@@ -9,15 +9,14 @@ from typing import Any, Literal
 
 import jax
 
-from dtprob import __version__
 from dtprob.case import Case, EngineSection
 from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
+from dtprob.edition import edition
 from dtprob.errors import InputError
-from dtprob.files import write_text
+from dtprob.files import sha256, write_text
 from dtprob.inference import LATENTS_ONLY, Posterior, RunOptions
 from dtprob.workflow import Prepared, prepare
-from dtprob.workflow.prepare import sha256
 
 
 @dataclass(frozen=True)
@@ -127,7 +126,7 @@ def _identity(prepared: Prepared, file: Path) -> str:
     reference = prepared.case.data.reference
     made_from = prepared.data_sha256 if file.stem == "posterior" or not reference else sha256(reference)
     made_from += f"\n{prepared.made_of_sha256}"
-    return f"dtprob {__version__}\n{prepared.engine!r}\n{prepared.case!r}\n{made_from}\n"
+    return f"dtprob {edition()}\n{prepared.engine!r}\n{prepared.case!r}\n{made_from}\n"
 
 
 def _read(file: Path) -> str | None:

@@ -14,8 +14,9 @@ from typing import Any, Final
 from pebble import ProcessExpired, ProcessPool
 
 from dtprob.commands.progress import Say, telling
+from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
-from dtprob.files import write_text
+from dtprob.files import sha256, write_text
 
 TRACKS: Final = {
     "channel": "dtprob.physical.cases",
@@ -25,6 +26,8 @@ TRACKS: Final = {
 }
 """For each track, the module whose `TRACK` writes its cases and their key."""
 
+_IDENTITY: Final = "identity.txt"
+"""File that tells of which case, by which seed and which code the answers beside it are."""
 _LIFE: Final = 32
 """Cases after which a worker is replaced, so that memory does not grow."""
 
@@ -83,7 +86,7 @@ def run(
         seed: instead of the cases' own.
         no_code: refuse cases that run code of their own.
         rivals: let rivals answer too, into OUT/NAME/rivals.json.
-        resume: keep the answers that are there.
+        resume: keep the answers that are there, where case, seed and dtprob's own code are what they were.
 
     Raises:
         InputError: no cases, or a number of workers below 1.
@@ -96,16 +99,16 @@ def run(
             f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
         )
     wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
-    todo = [n for n in found if not resume or any(not (out / n / file).is_file() for file in wanted)]
-    jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in todo]
+    jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in found]
+    jobs = [job for job in jobs if any(not job.keeps(file) for file in wanted)]
     failed: list[str] = []
     with telling() as say:
-        say(f"{len(todo)} of {len(found)} cases to diagnose")
+        say(f"{len(jobs)} of {len(found)} cases to diagnose")
         for done, (name, error) in enumerate(_answers(jobs, workers, say), start=1):
             if error is not None:
                 failed.append(name)
                 write_text(out / name / "error.txt", f"{error}\n")
-            say(f"{done} of {len(todo)}")
+            say(f"{done} of {len(jobs)}")
     if failed:
         raise RuntimeError(f"{len(failed)} cases failed, see error.txt of {', '.join(failed[:5])}")
 
@@ -157,6 +160,21 @@ class _Job:
     no_code: bool
     resume: bool
 
+    def keeps(self, file: str) -> bool:
+        """Whether an answer is there already and is kept."""
+        return self.resume and (self.folder / file).is_file() and self.is_same
+
+    @property
+    def is_same(self) -> bool:
+        """Whether what lies in the folder is of the same case, seed and code."""
+        identity = self.folder / _IDENTITY
+        return identity.is_file() and identity.read_text(encoding="utf-8") == self.identity
+
+    @property
+    def identity(self) -> str:
+        """What the answers depend on, as text."""
+        return f"dtprob {edition()}\nseed {self.seed}\ncase {sha256(self.case)}\n"
+
 
 def _answers(jobs: Sequence[_Job], workers: int, say: Say) -> Iterator[tuple[str, str | None]]:
     """The name of each case as it ends, and why it failed if it did; a worker that dies takes its one case with it."""
@@ -194,11 +212,14 @@ def _diagnose(job: _Job) -> str | None:
     warnings.simplefilter("ignore")  # a report says itself what there is to note
     answers = {"report.json": answer, "rivals.json": answer_of_rivals}
     job.folder.mkdir(parents=True, exist_ok=True)
+    todo = [file for file in job.wanted if not job.keeps(file)]
+    for file in todo if job.is_same else (*answers, "timing.json"):
+        (job.folder / file).unlink(missing_ok=True)  # what breaks off has no answer, not an older one
+    write_text(job.folder / _IDENTITY, job.identity)
     try:
         case = load_case(job.case / "case.toml")
-        for file in job.wanted:
-            if not (job.resume and (job.folder / file).is_file()):
-                answers[file](case, job.folder, seed=job.seed, no_code=job.no_code)
+        for file in todo:
+            answers[file](case, job.folder, seed=job.seed, no_code=job.no_code)
     except Exception as error:  # noqa: BLE001  (one bad case must not end the others)
         return f"{type(error).__name__}: {error}"
     (job.folder / "error.txt").unlink(missing_ok=True)

@@ -1,7 +1,7 @@
 """What all tracks of withheld cases share: the loop over the cases, their records, the key.
 
 A study is a folder: what a diagnosis may read lies in `cases/NNNN`; what is true of each case lies apart, in
-`truth/NNNN.json` and, gathered, in `key.json`.
+`truth/NNNN.json` and, gathered, in `key.json`; `study.json` says what was asked for.
 """
 
 from __future__ import annotations
@@ -137,13 +137,16 @@ class Track[C]:
             The key's file.
 
         Raises:
-            InputError: an unknown kind or family, nothing asked for, or a lambda that is not positive or that no effect
-                of several campaigns can reach.
+            InputError: an unknown kind or family, nothing asked for, a lambda that is not positive or that no effect
+                of several campaigns can reach, or a folder that holds another study.
         """
         kinds = self.usual if kinds is None else kinds
         families = self.listed if families is None else families
         lambdas = (float(lambda_),) if isinstance(lambda_, int | float) else tuple(map(float, lambda_))
         self._check(kinds, families, lambdas)
+        self._begin(
+            out, {"seed": seed, "kinds": [*kinds], "lambdas": lambdas, "families": [*families]}, resume=resume
+        )
 
         @lru_cache(maxsize=2)
         def campaign(number: int, again: int) -> C:
@@ -175,6 +178,18 @@ class Track[C]:
             raise InputError(
                 "withheld cases", "kinds, families and positive values of lambda", got, "Give them"
             )
+
+    def _begin(self, out: Path, asked: Mapping[str, Any], *, resume: bool) -> None:
+        """Write what the study is, or see that what lies there is part of the same one."""
+        file, whole = out / "study.json", {"track": self.name, "plan": dict(self.plan), **asked}
+        text = json.dumps(whole, indent=1)
+        begun = (out / "truth").is_dir() or file.is_file()
+        if resume and begun and not (file.is_file() and file.read_text(encoding="utf-8") == text):
+            expected = f"a folder without cases, or with cases of seed {asked['seed']} and the same settings"
+            raise InputError(
+                f"{out}", expected, "cases of another study", "Give another folder, or empty this one"
+            )
+        write_text(file, text)
 
     def _write_key(self, out: Path, count: int, seed: int) -> Path:
         """Gather the records of all cases."""

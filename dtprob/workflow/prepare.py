@@ -17,6 +17,7 @@ from dtprob.data import ChannelData, Data, PowerData, Table, read, read_table
 from dtprob.data.location import located
 from dtprob.effects import Effect, catalogue, summaries, with_effects
 from dtprob.errors import InputError, unknown_name
+from dtprob.files import sha256
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
 from dtprob.models.arguments import Model
@@ -146,17 +147,6 @@ def make_engine(section: EngineSection, where: str) -> AbstractEngine:
             expected = f"a value like {default!r}"
             raise InputError(f"{where} options {name}", expected, repr(value), "Correct the value")
     return kind(**section.options)
-
-
-def sha256(path: Path) -> str:
-    """Hash of a file, or of all files of a folder by name."""
-    digest = hashlib.sha256()
-    files = sorted(entry for entry in path.rglob("*") if entry.is_file()) if path.is_dir() else [path]
-    for file in files:
-        if path.is_dir():
-            digest.update(str(file.relative_to(path)).encode())
-        digest.update(file.read_bytes())
-    return digest.hexdigest()
 
 
 def _model(case: Case) -> Model:

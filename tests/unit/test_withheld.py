@@ -101,6 +101,30 @@ def test_resume_keeps_answers(answered):
     assert file.stat().st_mtime_ns == before
 
 
+@pytest.mark.parametrize("change", ["table", "code", "seed"])
+def test_resume_keeps_no_answers_to_another_case(answered, tmp_path, change, monkeypatch):
+    """Nor does a case that breaks off keep an older answer."""
+    folder = tmp_path / "study"
+    shutil.copytree(answered / "cases" / "0001", folder / "cases" / "0001")
+    shutil.copytree(answered / "answers" / "0001", folder / "answers" / "0001")
+    (folder / "cases" / "0001" / "line_effects.py").write_text(EFFECTS)  # the same content
+    run = ["withheld", "run", str(folder / "cases"), "--out", str(folder / "answers"), "--resume"]
+    report = folder / "answers" / "0001" / "report.json"
+    before = report.stat().st_mtime_ns
+    assert main(run) == 0
+    assert report.stat().st_mtime_ns == before
+    if change == "table":
+        (folder / "cases" / "0001" / "line.csv").write_text("x,y\n1,a\n")
+        assert main(run) == 1
+        assert not report.exists()
+        assert not (report.parent / "rivals.json").exists()
+        return
+    if change == "code":
+        (report.parent / "identity.txt").write_text("dtprob 0.0.1\n")
+    assert main([*run, *(["--seed", "5"] if change == "seed" else [])]) == 0
+    assert report.stat().st_mtime_ns > before
+
+
 def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(withheld, "_LIFE", 2)
     for name in "abcdef":

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from dtprob import __version__
+from dtprob.edition import edition
 from dtprob.workflow.loop.phases import PHASES, Twin
 from dtprob.workflow.loop.settings import TwinCase
 from dtprob.workflow.loop.state import State
@@ -35,7 +35,7 @@ def history(case: TwinCase, state: State) -> dict[str, Any]:
         "model": case.model.name,
         "physical": case.physical.environment or str(case.physical.log),
         "seed": case.seed.value,
-        "dtprob": __version__,
+        "dtprob": edition(),
         "finished": finished(state),
         "slots": state.slots,
         "rounds": state.round,

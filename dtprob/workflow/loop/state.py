@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from dtprob import __version__
+from dtprob.edition import edition
 from dtprob.errors import InputError
 from dtprob.files import atomic_write
 from dtprob.models.multi_access import priors
@@ -107,4 +107,4 @@ def load(case: TwinCase, path: Path) -> State:
 def _identity(case: TwinCase) -> str:
     """What a state depends on, as text; the paths of files do not matter."""
     parts = (case.model, case.physical, case.loop, case.effects, case.seed)
-    return "\n".join([f"dtprob {__version__}", *map(repr, parts)])
+    return "\n".join([f"dtprob {edition()}", *map(repr, parts)])

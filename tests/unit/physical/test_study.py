@@ -44,6 +44,18 @@ def test_a_campaign_that_cannot_carry_an_effect_is_replaced(tmp_path):
     assert [c["effects"] for c in again["cases"]] == [c["effects"] for c in key["cases"]]
 
 
+def test_a_folder_holds_one_study(tmp_path):
+    track(2.0).generate(tmp_path, 3, 0, lambda_=1.0)
+    made = track(2.0).generate(tmp_path, 5, 0, lambda_=1.0, resume=True)
+    assert len(json.loads(made.read_text())["cases"]) == 5
+    for seed, lambda_ in ((1, 1.0), (0, 0.5)):
+        with pytest.raises(InputError, match="another study"):
+            track(2.0).generate(tmp_path, 5, seed, lambda_=lambda_, resume=True)
+    (tmp_path / "study.json").unlink()
+    with pytest.raises(InputError, match="another study"):
+        track(2.0).generate(tmp_path, 5, 0, lambda_=1.0, resume=True)
+
+
 def test_what_no_campaign_can_carry_is_refused(tmp_path):
     with pytest.raises(InputError, match="Ask for less"):
         track(1.0).generate(tmp_path, 1, 0, lambda_=1.0)
