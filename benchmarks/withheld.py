@@ -69,7 +69,7 @@ def against_rivals(keys: Sequence[Path], answers: str) -> dict[str, list[dict[st
     """What each method reached on the cases of all tracks that the rivals answered too; empty where there are none."""
     every: dict[str, list[Answer]] = {}
     for key in keys:
-        files = {str(a.truth["name"]): a for a in answered(key, answers) if a.report is not None}
+        files = {str(a.truth["name"]): a for a in answered(key, answers)}
         rivals = {name: key.parent / answers / name / "rivals.json" for name in files}
         said = {name: read(file) for name, file in rivals.items() if file.is_file()}
         own = {name: files[name] for name in said}
@@ -80,8 +80,9 @@ def against_rivals(keys: Sequence[Path], answers: str) -> dict[str, list[dict[st
 
 def scored(key: Path, answers: str) -> dict[str, Any]:
     """The score of one track."""
-    reports = {str(a.truth["name"]): a.report for a in answered(key, answers)}
-    return score(read(key), reports)
+    found = {str(a.truth["name"]): a for a in answered(key, answers)}
+    seconds = {name: a.seconds for name, a in found.items() if a.seconds is not None}
+    return score(read(key), {name: a.report for name, a in found.items()}, seconds=seconds)
 
 
 def read(file: Path) -> dict[str, Any]:
@@ -96,7 +97,8 @@ def markdown(lines: Mapping[str, list[dict[str, Any]]]) -> str:
     table = [head, ["---"] * len(head)]
     for row in next(iter(lines.values())):
         cells = [shown(found[name].get(row["name"])) for name in lines]
-        table.append([row["name"], f"{row['from_lambda']:g}", goal(**row["target"]), *cells])
+        span = f"{row['from_lambda']:g}" + ("" if row["to_lambda"] is None else f" to {row['to_lambda']:g}")
+        table.append([row["name"], span, goal(**row["target"]), *cells])
     return "\n".join(f"| {' | '.join(cells)} |" for cells in table)
 
 
@@ -105,7 +107,7 @@ def shown(row: Mapping[str, Any] | None) -> str:
     if row is None:
         return ""
     found = f"{row['count']} of {row['of']}" if "count" in row else f"{row['value']:.3g} ({row['of']})"
-    return f"{found}, {row['low']:.3g} to {row['high']:.3g}"
+    return found if row["low"] is None else f"{found}, {row['low']:.3g} to {row['high']:.3g}"
 
 
 def goal(lowest: float | None, highest: float | None) -> str:

@@ -45,6 +45,11 @@ class Answer:
         """Information that each effect carries alone; 0 where there is none."""
         return 0.0 if self.kind == "null" else float(self.truth.get("lambda") or 0.0)
 
+    def lambda_of(self, effect: Mapping[str, Any]) -> float:
+        """Information that a true effect carries, or that the key promises for each where it does not tell."""
+        own = effect.get("lambda")
+        return self.lambda_ if own is None else float(own)
+
     @property
     def verdict(self) -> str:
         """The verdict, or FAILED."""
@@ -79,7 +84,12 @@ class Answer:
     @property
     def is_alarm(self) -> bool:
         """Whether a gap is claimed."""
-        return self.verdict not in {"NO_GAP", "FAILED"}
+        return self.verdict != "NO_GAP" and not self.is_failed
+
+    @property
+    def is_failed(self) -> bool:
+        """Whether there is no answer."""
+        return self.report is None
 
     @property
     def is_missed(self) -> bool:
@@ -88,8 +98,8 @@ class Answer:
 
     @property
     def is_right(self) -> bool:
-        """Whether the most probable cause is exactly the true set of effects."""
-        return self.named == self.effects
+        """Whether the most probable cause is exactly the true set of effects, and the verdict does not say none is."""
+        return self.named == self.effects and not self.is_unlisted
 
     @property
     def is_right_family(self) -> bool:
@@ -99,7 +109,7 @@ class Answer:
     @property
     def is_in_class(self) -> bool:
         """Whether the true set is among those that the answer holds possible."""
-        return self.is_right or self.effects in self.alias_class
+        return self.is_right or (self.effects in self.alias_class and not self.is_unlisted)
 
     @property
     def is_listed(self) -> bool:
@@ -111,9 +121,13 @@ class Answer:
         """Whether the verdict says that the cause is not among the candidates."""
         return self.verdict == "UNLISTED"
 
-    def wrong_names(self) -> list[bool]:
-        """For each named effect whether it is none of the true ones."""
-        return [name not in self.effects for name in self.named]
+    def wrong_names(self) -> list[tuple[float, float]]:
+        """How many of the named effects are none of the true ones, and how many are named; nothing where none is."""
+        return [(float(len(self.named - self.effects)), float(len(self.named)))] if self.named else []
+
+    def names_wrong(self) -> list[bool]:
+        """Whether one of the named effects is none of the true ones; nothing where none is named."""
+        return [bool(self.named - self.effects)] if self.named else []
 
     def names_alias(self) -> list[bool]:
         """Whether the effect that looks like the true one is in the class, too."""
@@ -124,10 +138,18 @@ class Answer:
         """Whether the first of the sites that the answer points at is one at which the true effects show."""
         known = SITES.get(self.track, {})
         true = {site for e in self.truth["effects"] for site in known.get(str(e.get("family")), ())}
-        if self.report is None or "where" not in self.report or not true:
+        if not true or (self.report is not None and "where" not in self.report):
             return []
-        places = [*self.report["unlisted"]["sites"], *(s["site"] for s in self.report["where"]["sites"])]
-        return [self.is_alarm and bool(places) and places[0] in true]
+        if self.report is None:
+            return [False]
+        located = self.report["where"]["sites"]
+        places = [*self.report["unlisted"]["sites"], *(s["site"] for s in located)]
+        if not self.is_alarm or not places:
+            return [False]
+        if f"spread of {places[0]}" in true:
+            families = [s.get("family", "") for s in located if s["site"] == places[0]]
+            return [any(family.startswith("spread") for family in families)]
+        return [places[0] in true]
 
     def covered_size(self) -> list[bool]:
         """Whether the 90% interval of the size holds the true one, where one right effect has a comparable size."""
@@ -146,7 +168,7 @@ class Answer:
         That is 1 - d / lambda for d parameters that are known from (K - 1) / K of the data, lambda of all effects together.
         """
         closed = self.first.get("closed_fraction") if self.first else None
-        total = sum(float(effect.get("lambda") or 0.0) for effect in self.truth["effects"])
+        total = sum(map(self.lambda_of, self.truth["effects"]))
         if not (self.is_right and closed and total > 0 and self.first):
             return []
         folds, size = Settings().folds, len(self.first.get("size", {}))
@@ -156,9 +178,18 @@ class Answer:
     def limit(self) -> Limit | None:
         """What the best possible diagnosis reaches; None where there is not one effect, or the report cannot tell."""
         effects, alike = self.truth["effects"], self._alike
-        if alike is None or len(effects) != 1 or effects[0]["name"] not in alike[0]:
+        if alike is None or len(effects) != 1 or not (places := self._candidates(effects[0])):
             return None
-        return limit(alike[1], alike[0].index(effects[0]["name"]), float(effects[0].get("lambda") or 0.0))
+        seen = {
+            line["effect"]: abs(float(line["z"] or 0.0)) for line in (self.report or {}).get("screening", [])
+        }
+        best = max(places, key=lambda place: seen.get(alike[0][place], 0.0))
+        return limit(alike[1], best, self.lambda_of(effects[0]))
+
+    def _candidates(self, effect: Mapping[str, Any]) -> list[int]:
+        """Positions of a true effect among the candidates: all of its family where the key tells no instance."""
+        names, true = [] if self._alike is None else self._alike[0], str(effect["name"])
+        return [place for place, name in enumerate(names) if self._told([name]) == {true}]
 
     @property
     def _alike(self) -> tuple[list[str], np.ndarray] | None:
@@ -169,14 +200,11 @@ class Answer:
     @property
     def is_resolvable(self) -> bool:
         """Whether each true effect can be told from every other candidate beside the others, as far as the report tells."""
-        if self._alike is None:
+        places = [(self._candidates(effect), self.lambda_of(effect)) for effect in self.truth["effects"]]
+        if self._alike is None or not all(found for found, _ in places):
             return False
-        names, correlation = self._alike
-        known = {
-            names.index(e["name"]): float(e.get("lambda") or 0.0)
-            for e in self.truth["effects"]
-            if e["name"] in names
-        }
+        correlation = self._alike[1]
+        known = {found[0]: lambda_ for found, lambda_ in places}
         return all(
             is_resolvable(correlation, own, lambda_, [k for k in known if k != own])
             for own, lambda_ in known.items()
@@ -184,17 +212,10 @@ class Answer:
 
     @property
     def unexplained(self) -> float:
-        """Lambda that the candidates leave, lambda (1 - R^2).
-
-        They explain what the best score of a single one does, or twice the nats that the named cause gains on held-out
-        clusters, if that is more.
-        """
-        report = self.report or {}
-        best = max((float(line["z"] or 0.0) ** 2 for line in report.get("screening") or []), default=0.0)
-        gap, fit = report.get("gap", {}), report.get("fit", {})
-        known = gap.get("before") is not None and gap.get("after") is not None
-        gained = 2 * (gap["before"] - gap["after"]) * fit.get("n_observations", 0) if known else 0.0
-        return max(self.lambda_ - max(best - 1, gained, 0.0), 0.0)
+        """Lambda that the candidates leave, lambda (1 - R^2): they explain what the best score of a single one does."""
+        screening = (self.report or {}).get("screening") or []
+        best = max((float(line["z"] or 0.0) ** 2 for line in screening), default=0.0)
+        return max(self.lambda_ - max(best - 1, 0.0), 0.0)
 
     def over_limit(self, of: Callable[[Limit], float]) -> list[tuple[float, float]]:
         """Whether the right effect is first, and what the best possible diagnosis reaches."""
@@ -204,7 +225,8 @@ class Answer:
         """Whether the right effect has the first place of the screening, and the chance of the best possible one."""
         if self.limit is None or self.report is None or "where" not in self.report:
             return []
-        return [(float({self.report["screening"][0]["effect"]} == self.effects), self.limit.first)]
+        first = self._told([self.report["screening"][0]["effect"]])
+        return [(float(first == self.effects), self.limit.first)]
 
     def class_over_limit(self) -> list[tuple[float, float]]:
         """Size of the class of a single effect, and that of the best possible one."""
@@ -214,7 +236,9 @@ class Answer:
 
     def cell_scores(self) -> list[float]:
         """F1 of the cells inside the reported blocks, for each axis on which the truth is local."""
-        if self.report is None or "where" not in self.report:
+        if self.report is None:
+            return [0.0 for _ in self.truth.get("cells", {})]
+        if "where" not in self.report:
             return []
         blocks, scores = self.report["where"]["coordinates"], []
         for axis, cells in self.truth.get("cells", {}).items():

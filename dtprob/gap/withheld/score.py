@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any, Final
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, unknown_name
 from dtprob.gap.withheld.answers import Answer, Report, Truth
 from dtprob.gap.withheld.rates import quantiles, rates
 from dtprob.gap.withheld.targets import against_targets
@@ -14,21 +14,24 @@ from dtprob.gap.withheld.targets import against_targets
 type Test = Callable[[Answer], Iterable[bool]]
 
 _LISTED_KINDS: Final = ("listed", "pair", "triple", "alias")
+_KINDS: Final = ("null", *_LISTED_KINDS, "unlisted")
+SAME: Final = "dtprob, on the cases of the rivals"
+"""What the diagnosis is called where it stands beside rivals that have not answered all cases."""
 _SHARED: Final = ("screening", "provenance")
 """Parts of a report by which all methods are judged alike."""
 _EXACT: Final[Mapping[str, Test]] = {
     "right effect first": lambda answer: [answer.is_right],
     "right family first": lambda answer: [answer.is_right_family],
     "truth in the class": lambda answer: [answer.is_in_class],
-    "wrong among the named": Answer.wrong_names,
+    "names a wrong effect": Answer.names_wrong,
     "verdict names a cause": lambda answer: [answer.is_listed],
     "says unlisted": lambda answer: [answer.is_unlisted],
     "missed": lambda answer: [answer.is_missed],
 }
 _MEASURES: Final[Mapping[str, Mapping[str, Test]]] = {
     "null": {
-        "alarm": lambda answer: [answer.is_alarm],
-        "says unlisted": lambda answer: [answer.is_unlisted],
+        "alarm": lambda answer: [] if answer.is_failed else [answer.is_alarm],
+        "says unlisted": lambda answer: [] if answer.is_failed else [answer.is_unlisted],
     },
     "listed": {
         **_EXACT,
@@ -61,14 +64,17 @@ def score(
         seconds: that the diagnosis took, by the case's name.
 
     Returns:
-        `targets`, what is to be reached beside what was; `strata`, per kind and lambda: number of cases, verdicts, rates
-        with intervals, size of the alias class, closed fraction and width of its interval, seconds, and `rivals`, of which
-        each has the same as far as it says it; `cases`, what was said of each; `missing`, the cases without an answer.
+        `targets`, what is to be reached beside what was, and what the rivals reached; `strata`, per kind and lambda: number
+        of cases, verdicts, rates with intervals, size of the class, closed fraction and width of its interval, seconds,
+        and `rivals`, of which each has the same as far as it says it; `cases`, what was said of each; `missing`, the cases
+        without an answer.
 
     Raises:
-        InputError: the key is none, or no case has an answer.
+        InputError: the key is none, no case has an answer, or one is of other data than the key's.
     """
     truths, track = _truths(key), str(key.get("track"))
+    for name, report in reports.items():
+        _check_data(name, truths.get(name, {}), report or {})
     answers = {
         name: Answer(track, truth, reports[name], seconds.get(name))
         for name, truth in truths.items()
@@ -80,6 +86,8 @@ def score(
         )
     strata = {(a.kind, a.lambda_): [n for n in answers if _same(answers[n], a)] for a in answers.values()}
     theirs = rival_answers(answers, rivals)
+    if theirs and any(name not in rivals for name in answers):
+        theirs = {SAME: {name: answers[name] for name in answers if name in rivals}, **theirs}
     return {
         "format": "dtprob.score",
         "version": 2,
@@ -107,12 +115,25 @@ def score(
 def _truths(key: Mapping[str, Any]) -> dict[str, Truth]:
     try:
         truths = {str(case["name"]): case for case in key["cases"]}
-        for truth in truths.values():
-            _ = truth["kind"], [effect["name"] for effect in truth["effects"]]
+        for name, truth in truths.items():
+            _ = [effect["name"] for effect in truth["effects"]]
+            if truth["kind"] not in _KINDS:
+                raise unknown_name(f"kind of case {name} in the key", str(truth["kind"]), _KINDS, "kind")
     except (KeyError, TypeError) as error:
         expected = "`cases`, each with name, kind, lambda and effects"
         raise InputError("key", expected, f"none of {error}", "Give the key.json of these cases") from error
     return truths
+
+
+def _check_data(name: str, truth: Truth, report: Report) -> None:
+    """Answers of another study have the same names of cases: where both tell hashes of the data, these tell."""
+    made_of = report.get("provenance", {}).get("data_sha256")
+    known = truth.get("sha256")
+    if made_of and known and made_of not in known.values():
+        remedy = "Give the key of the cases that these are answers to"
+        raise InputError(
+            f"answer {name}", "one to the case that the key describes", "one of other data", remedy
+        )
 
 
 def _same(one: Answer, other: Answer) -> bool:

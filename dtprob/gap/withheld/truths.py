@@ -91,7 +91,7 @@ SITES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
             ("regional_bias", "scale_bias", "stale_map", "saturation", "swapped_segments", "periodic_bias"),
             ("predicted_label",),
         ),
-        "label_noise": ("label_deviation", "y"),
+        "label_noise": ("label_deviation", "spread of y"),
         "autocorrelated_errors": ("predicted_label", "y"),
     },
     "custom": {
@@ -108,7 +108,9 @@ SITES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
         "own_level": ("expected_power", "fading"),
     },
 }
-"""For each track and family of what is wrong, the twin's sites at which it shows."""
+"""For each track and family of what is wrong, the twin's sites at which it shows.
+
+`spread of y` is what is observed at y where the report finds its spread, not its place, to be wrong."""
 
 type Sizes = Callable[[float], tuple[float, ...]]
 

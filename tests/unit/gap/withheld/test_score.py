@@ -1,12 +1,13 @@
 """Scores of withheld cases."""
 
+import numpy as np
 import pytest
 from scipy import stats
 
 from dtprob.errors import InputError
 from dtprob.gap.withheld.answers import Answer
-from dtprob.gap.withheld.rates import Rate
-from dtprob.gap.withheld.score import score
+from dtprob.gap.withheld.rates import Rate, median, ratio, share_within
+from dtprob.gap.withheld.score import SAME, score
 from dtprob.gap.withheld.truths import PARAMETERS, SITES
 from dtprob.physical import custom_cases, draws, labels_cases
 from dtprob.physical.multi_access import faults
@@ -82,7 +83,8 @@ def test_a_family_counts_where_the_key_tells_no_instance_and_the_library_has_not
     answer = Answer(track, case("0000", "listed", true), report("LISTED", named), None)
     assert answer.is_right is right
     assert answer.is_in_class is right
-    assert answer.wrong_names() == [not right]
+    assert answer.names_wrong() == [not right]
+    assert answer.wrong_names() == [(float(not right), 1.0)]
 
 
 def test_counts_per_stratum(scored):
@@ -165,7 +167,8 @@ def test_the_first_site_is_that_of_the_remainder_or_else_of_the_map():
 
 def test_named_effects_are_counted_one_by_one():
     said = answered("custom", [true("wall"), true("sector")], named=["wall", "gain_drift", "second_slope"])
-    assert sorted(said.wrong_names()) == [False, True, True]
+    assert said.wrong_names() == [(2.0, 3.0)]
+    assert said.names_wrong() == [True]
 
 
 def test_every_family_of_every_track_has_its_sites():
@@ -199,7 +202,7 @@ def test_targets_are_counted_over_the_strata_that_they_speak_of():
     assert (found["right effect first"]["count"], found["right effect first"]["of"]) == (1, 3)
     assert (found["alarm without a gap"]["count"], found["alarm without a gap"]["of"]) == (1, 2)
     assert "exact set of two" not in found  # the only pair carries too little information
-    assert (found["called unlisted and is not"]["count"], found["called unlisted and is not"]["of"]) == (0, 6)
+    assert (found["called unlisted and is not"]["count"], found["called unlisted and is not"]["of"]) == (0, 5)
     assert (
         found["closed fraction of .90 or more"]["count"],
         found["closed fraction of .98 or more"]["count"],
@@ -207,7 +210,108 @@ def test_targets_are_counted_over_the_strata_that_they_speak_of():
     assert "Against what is to be reached" in render_score(score(KEY, REPORTS))
 
 
+def test_rivals_of_some_cases_stand_beside_the_diagnosis_of_the_same_ones():
+    found = score(KEY, REPORTS, {"0001": {"lasso": report("NO_GAP")}})
+    alarm = next(line for line in found["targets"] if line["name"] == "alarm without a gap")
+    assert (alarm["count"], alarm["of"]) == (1, 2)
+    assert {name: (said["count"], said["of"]) for name, said in alarm["rivals"].items()} == {
+        SAME: (1, 1),
+        "lasso": (0, 1),
+    }
+    assert SAME in render_score(found)
+    everywhere = {name: {"lasso": report("NO_GAP")} for name in REPORTS}
+    assert set(score(KEY, REPORTS, everywhere)["targets"][0]["rivals"]) == {"lasso"}
+
+
+def test_what_broke_off_is_no_silence():
+    """A diagnosis that fails on a case without a gap has not kept quiet, and where one is it has found nothing."""
+    failed = Answer("custom", case("0000", "null"), None, None)
+    assert score({"cases": [failed.truth]}, {"0000": None})["targets"] == []
+    gusts = Answer("custom", {**case("0001", "unlisted"), "effects": [true("gusts")]}, None, None)
+    assert gusts.right_site() == [False]
+    assert Answer("x", {**case("0001", "listed", "a"), "cells": {"row": [1]}}, None, None).cell_scores() == [
+        0.0
+    ]
+
+
+def test_who_says_that_none_of_them_is_it_has_not_named_the_truth():
+    said = {**report("LISTED", "doppler"), "verdict": "UNLISTED"}
+    answer = Answer("channel", case("0000", "listed", "doppler"), said, None)
+    assert not answer.is_right
+    assert not answer.is_in_class
+
+
+def alike(*names, percent, z=()):
+    """The parts of a report that tell which candidates there were and how they look alike."""
+    screening = [{"effect": name, "z": size} for name, size in zip(names, z, strict=False)]
+    return {"provenance": {"alike": {"effects": list(names), "percent": percent}}, "screening": screening}
+
+
+def test_a_key_may_tell_lambda_of_the_case_alone():
+    said = report("LISTED", "a") | alike("a", "b", percent=[[], [20]])
+    key = {"cases": [case("0000", "listed", "a"), case("0001", "pair", "a", "b")]}
+    found = score(
+        key, {"0000": said, "0001": report("LISTED", "a", "b") | alike("a", "b", percent=[[], [20]])}
+    )
+    assert found["cases"][0]["best_possible"] > 0.99
+    assert "exact set of two, resolvable" in {line["name"] for line in found["targets"]}
+    nothing = {"cases": [case("0000", "listed", "a", size=0.0001)]}
+    assert score(nothing, {"0000": said})["cases"][0]["best_possible"] < 0.05
+
+
+def test_what_the_library_has_in_instances_is_found_by_its_family():
+    said = alike("doppler", "extra_path[one]", "extra_path[two]", percent=[[], [0], [0, 95]], z=[0, 3.0, 9.0])
+    answer = Answer("channel", case("0000", "listed", "extra_path"), report("LISTED", "doppler") | said, None)
+    assert answer.limit is not None
+    assert answer.limit.first > 0.5
+    pair = Answer("channel", case("0001", "pair", "extra_path", "unknown"), said, None)
+    assert not pair.is_resolvable
+
+
+def test_the_spread_of_what_is_observed_is_another_site_than_its_place():
+    noisy = [true("label_noise")]
+
+    def said(family):
+        sites = [{"site": "y", "family": family}]
+        report = {"verdict": "UNLISTED", "causes": [], "unlisted": {"sites": []}, "where": {"sites": sites}}
+        return Answer("labels", {"kind": "unlisted", "lambda": 100.0, "effects": noisy}, report, None)
+
+    assert said("spread, smooth in sample").right_site() == [True]
+    assert said("ripple in sample").right_site() == [False]
+
+
+def test_things_of_one_case_are_not_independent():
+    """Two sets of three that are all wrong say as much as two cases do, not six."""
+    found = share_within([(3.0, 3.0), (3.0, 3.0), (0.0, 3.0), (0.0, 3.0)])
+    assert (found["count"], found["of"], found["rate"]) == (6, 12, 0.5)
+    assert (found["low"], found["high"]) == Rate(2, 4).interval
+
+
+@pytest.mark.parametrize("count", [1, 3, 5, 6, 9, 40])
+def test_medians_have_intervals_that_hold_or_none(count):
+    draws = np.random.default_rng(0).normal(size=(2000, count))
+    found = [median(row) for row in draws]
+    if count < 6:
+        assert all(one["low"] is None for one in found)
+    else:
+        held = sum(one["low"] <= 0 <= one["high"] for one in found)
+        assert stats.binomtest(held, 2000, 0.95, alternative="less").pvalue > 1e-3
+
+
+def test_few_or_equal_ratios_have_no_interval():
+    assert ratio([(1.0, 1.0)] * 13)["low"] is None
+    assert ratio([(0.5, 1.0), (0.7, 1.0)])["low"] is None
+    found = ratio([(x, 1.0) for x in (0.5, 0.6, 0.7, 0.8, 0.9, 1.0)])
+    assert found["low"] < 0.75 < found["high"]
+
+
 def test_wrong_keys_and_answers():
+    with pytest.raises(InputError, match="'Listed'"):
+        score({"cases": [case("0000", "Listed", "a")]}, {"0000": report("NO_GAP")})
+    other = report("NO_GAP") | {"provenance": {"data_sha256": "ab"}}
+    with pytest.raises(InputError, match="one of other data"):
+        score({"cases": [case("0000", "null") | {"sha256": {"y.csv": "cd"}}]}, {"0000": other})
+    assert score({"cases": [case("0000", "null") | {"sha256": {"y.csv": "ab"}}]}, {"0000": other})["cases"]
     with pytest.raises(InputError, match=r"key\.json"):
         score({"cases": [{"name": "a"}]}, {})
     with pytest.raises(InputError, match="none"):
