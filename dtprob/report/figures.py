@@ -39,6 +39,7 @@ STYLE: dict[Any, Any] = {
     "savefig.facecolor": "none",
     "legend.frameon": False,
     "svg.fonttype": "none",
+    "text.parse_math": False,  # names are the user's: a $ in them is a $
     "svg.hashsalt": "dtprob",
 }
 

@@ -175,7 +175,7 @@ class Remainder(TypedDict):
 
 
 class Detectable(TypedDict):
-    """The smallest size of an effect that would have been noticed; null where none would have been."""
+    """The smallest size of an effect that would have been noticed nine times in ten; null where none would have been."""
 
     effect: str
     size: Number

@@ -164,11 +164,8 @@ def apart(name: str, size: Size, estimates: Sequence[float | None]) -> str:
 
 
 def shares(interval: Interval) -> str:
-    """An interval of shares: `88 to 97%`; from nothing on, unless all of it is below."""
-    low, high = interval["low"], interval["high"]
-    if low is not None and high is not None and high > 0:
-        low = max(low, 0.0)
-    return f"{percent(low).rstrip('%')} to {percent(high)}"
+    """An interval of shares: `88 to 97%`, or `−84 to 12%` of what may do harm."""
+    return f"{percent(interval['low']).rstrip('%')} to {percent(interval['high'])}"
 
 
 def significant[Located: (Site, Coordinates)](located: Iterable[Located]) -> list[Located]:

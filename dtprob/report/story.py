@@ -187,9 +187,7 @@ def _seen(detectable: list[Detectable]) -> str:
     some = [f"{entry.name} of {entry.size}" for entry in families[:3]]
     if not some:
         return "How large an effect would have been seen is not known."
-    return (
-        f"Effects larger than these would have been seen: {listing(some)}. Smaller ones cannot be ruled out."
-    )
+    return f"Effects of these sizes would have been seen nine times in ten: {listing(some)}. Smaller ones may be there."
 
 
 def _listed(report: Report) -> Story:

@@ -319,5 +319,5 @@ def test_effects_that_were_not_looked_for_any_more_are_told() -> None:
 
 
 def test_shares_below_nothing_are_told_as_they_are() -> None:
-    assert names.shares({"low": -0.2, "high": 0.4}) == "0 to 40%"
+    assert names.shares({"low": -0.2, "high": 0.4}) == "\u221220 to 40%"
     assert names.shares({"low": -1.5, "high": -0.46}) == "\u2212150 to \u221246%"
