@@ -27,7 +27,7 @@ from dtprob.gap.fitting.density import (
     volume_of,
 )
 from dtprob.gap.fitting.newton import NewtonStep, System, newton_step
-from dtprob.gap.fitting.plausible import is_one_sided, mixing_gain, nulls, places, scales, sides
+from dtprob.gap.fitting.plausible import mixing_gain, nulls, places, scales, sides
 from dtprob.gap.fitting.spread import Changes, respread
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.volume import Volume
@@ -45,6 +45,8 @@ _ALIKE: Final = 0.5
 """Change of the logarithm of a field's standard deviation up to which they may."""
 _CHEAP: Final = 0.25
 """What a step with kept curvatures counts for among the steps of a fit."""
+_AT_NULL: Final = 1e-6
+"""Standard deviations of its prior within which a size is at its null."""
 _STUCK: Final = 1e3
 """Damping beyond which a fit has arrived, whatever its quadratic promises."""
 
@@ -221,14 +223,33 @@ def _finish(problem: Problem, active: Active, x: np.ndarray, value: float, conve
     evidence -= 0.5 * float(active.weights @ np.linalg.slogdet(local)[1]) if local.shape[-1] else 0.0
     evidence -= 0.5 * float(np.linalg.slogdet(schur)[1]) if len(schur) else 0.0
     covariance = np.linalg.inv(schur) if len(schur) else schur
-    evidence += sum(_mixed(problem, active, x, covariance, e) for e in active.effects if e.kind == "mean")
+    pushed = pushed_out(problem, active, x, system.gradient)
+    evidence += 0.5 * float(pushed @ covariance @ pushed)
+    beyond = x.copy()
+    beyond[active.global_index] += covariance @ pushed
+    for effect in (e for e in active.effects if e.kind == "mean"):
+        index = problem.layout.of(effect)
+        place = np.searchsorted(active.global_index, index)
+        evidence += _mixed(effect, beyond[index], covariance[np.ix_(place, place)])
     names = tuple(e.name for e in active.effects)
     return Fit(x, names, active.spread, value, evidence, covariance, active.global_index, converged)
 
 
-def _mixed(problem: Problem, active: Active, x: np.ndarray, covariance: np.ndarray, effect: Effect) -> float:
-    """What mixing the scale of an effect's prior adds to the log evidence."""
-    index = problem.layout.of(effect)
-    place = np.ix_(*[[int(np.flatnonzero(active.global_index == i)[0]) for i in index]] * 2)
-    change, sided = x[index] - nulls(effect), is_one_sided(effect)
-    return mixing_gain(covariance[place], change, scales(effect), one_sided=sided, places=places(effect))
+def pushed_out(problem: Problem, active: Active, x: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+    """Slope (global,) of the log posterior at sizes that it pushes below a null that they cannot be below; 0 elsewhere.
+
+    With curvature H the mode of its quadratic lies H^-1 times that farther out, half the slope times that higher.
+    """
+    pushed = np.zeros(len(active.global_index))
+    for effect in (e for e in active.effects if e.kind == "mean"):
+        index = problem.layout.of(effect)
+        place = np.searchsorted(active.global_index, index)
+        edge = sides(effect) & ~places(effect) & (x[index] - nulls(effect) <= _AT_NULL * scales(effect))
+        pushed[place] = np.where(edge, np.minimum(gradient[place], 0.0), 0.0)
+    return pushed
+
+
+def _mixed(effect: Effect, mode: np.ndarray, covariance: np.ndarray) -> float:
+    """What mixing the scale of an effect's prior adds to the log evidence; the quadratic's mode may be out of range."""
+    change = mode - nulls(effect)
+    return mixing_gain(covariance, change, scales(effect), sides=sides(effect), places=places(effect))

@@ -7,14 +7,17 @@ log-uniformly, so that the price of an effect depends on how well the data deter
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
+from numpyro.distributions import constraints
 from scipy import special
 
-from dtprob.effects.effect import Effect
+from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.fitting.bounded import log_positive
+from dtprob.models.declaration import base_constraint
 
 SCALES: Final = np.geomspace(1e-4, 1.0, 25)
 """Prior scales, as shares of the largest plausible one."""
@@ -51,27 +54,35 @@ def mixing_gain(
     estimate: Float[np.ndarray, " n"],
     scale: Float[np.ndarray, " n"],
     *,
-    one_sided: bool = False,
+    sides: Bool[np.ndarray, " n"] | None = None,
     places: Bool[np.ndarray, " n"] | None = None,
 ) -> float:
     """What mixing the prior's scale adds to a log evidence that was computed at its largest.
 
+    That evidence is Laplace's, over all sizes, and with the density of the prior at the mode; of sizes that cannot be below
+    their null only those above it count.
+
     Args:
         covariance: of the parameters given the data, under the prior at its largest scale.
-        estimate: the posterior mode less the null.
+        estimate: the posterior mode less the null, of the quadratic: where data push a size against its null, below it.
         scale: the prior's standard deviations.
-        one_sided: of a single size that cannot be below its null.
+        sides: sizes that cannot be below their null; none by default.
         places: parameters whose prior is not mixed; none by default.
     """
+    n = len(scale)
+    sides, places = (np.zeros(n, bool) if v is None else v for v in (sides, places))
     precision = np.linalg.inv(covariance / np.outer(scale, scale))
-    information = precision - np.eye(len(scale))
-    unit, score = np.ones(len(scale)), precision @ (estimate / scale)
+    information, score = precision - np.eye(n), precision @ (estimate / scale)
     shares = np.array([*SCALES, 1.0])
-    if places is not None and places.any():
-        terms = _terms_with_places(information, score, shares, places, one_sided)
-    else:
-        terms = _terms(information, score, unit, shares, one_sided)
-    return float(special.logsumexp(terms[:-1]) - np.log(len(SCALES)) - terms[-1])
+    share = np.where(places, 1.0, shares[:, None])
+    spread = np.eye(n) + share[:, :, None] * information * share[:, None, :]
+    mean = np.linalg.solve(spread, (share * score)[..., None])[..., 0]
+    terms = 0.5 * (np.einsum("si,si->s", share * score, mean) - np.linalg.slogdet(spread)[1])
+    last, sided = terms[-1], sides & ~places
+    if sided.any():
+        among = np.linalg.inv(spread)[:, sided][:, :, sided]
+        terms = terms + log_positive(mean[:, sided], among)
+    return float(special.logsumexp(terms[:-1]) - np.log(len(SCALES)) - last)
 
 
 def _terms(
@@ -84,22 +95,6 @@ def _terms(
     terms = 0.5 * (scales[:, None] ** 2 * u**2 / spread - np.log(spread)).sum(axis=1)
     if one_sided and len(u) == 1:
         above = (score * scale)[0] * scales / np.sqrt(spread[:, 0])
-        terms = terms + np.log(2.0) + special.log_ndtr(above)
-    return terms
-
-
-def _terms_with_places(
-    information: np.ndarray, score: np.ndarray, shares: np.ndarray, places: np.ndarray, one_sided: bool
-) -> np.ndarray:
-    """The log Bayes factor at each share of the prior's scale, here 1, that of places left as it is."""
-    scale = np.where(places, 1.0, shares[:, None])
-    spread = np.eye(len(score)) + scale[:, :, None] * information * scale[:, None, :]
-    u = scale * score
-    mean = np.linalg.solve(spread, u[..., None])[..., 0]
-    terms = 0.5 * (np.einsum("si,si->s", u, mean) - np.linalg.slogdet(spread)[1])
-    if one_sided:
-        size = int(np.flatnonzero(~places)[0])
-        above = mean[:, size] / np.sqrt(np.linalg.inv(spread)[:, size, size])
         terms = terms + np.log(2.0) + special.log_ndtr(above)
     return terms
 
@@ -117,6 +112,22 @@ def nulls(effect: Effect) -> Float[np.ndarray, " n"]:
 def sides(effect: Effect) -> Bool[np.ndarray, " n"]:
     """Which of an effect's parameters cannot be below their null, flat."""
     return _flat(effect, [p.is_one_sided for p in effect.parameters])
+
+
+def limits(effect: Effect) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
+    """The lowest and the highest value that its prior allows each of an effect's parameters, flat."""
+    ends = [_ends(p) for p in effect.parameters]
+    return _flat(effect, [low for low, _ in ends]), _flat(effect, [high for _, high in ends])
+
+
+def _ends(parameter: Parameter) -> tuple[ArrayLike, ArrayLike]:
+    support: Any = base_constraint(parameter.prior.support)
+    if support in (constraints.positive, constraints.nonnegative):
+        return 0.0, np.inf
+    return (
+        np.asarray(getattr(support, "lower_bound", -np.inf)),
+        np.asarray(getattr(support, "upper_bound", np.inf)),
+    )
 
 
 def places(effect: Effect) -> Bool[np.ndarray, " n"]:

@@ -11,7 +11,7 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import local_maxima, polish
 from dtprob.gap.fitting.marginal import settled
 from dtprob.gap.fitting.marginal_mode import faithful
-from dtprob.gap.fitting.plausible import LARGE, places, plausible_spread, scales, sides
+from dtprob.gap.fitting.plausible import LARGE, places, plausible_spread, scales, sides, sizes
 from dtprob.gap.fitting.sweep import swept
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -128,8 +128,8 @@ def starting_points(
         moved = np.clip(step, -4 * scale, 4 * scale)
         one_step[index] += np.where(sided, np.maximum(moved, 1e-3 * scale), moved)
     local = places(effect)[:_LINES]
-    sizes = [(int(i), float(scale[j]), bool(sided[j])) for j, i in enumerate(index[:_LINES]) if not local[j]]
-    reached, peaks = _along(problem, one_step, x, sizes, settings)
+    lines = [(int(i), float(scale[j]), bool(sided[j])) for j, i in enumerate(index[:_LINES]) if not local[j]]
+    reached, peaks = _along(problem, one_step, x, lines, settings)
     if local.any():  # they do nothing beside the null, so they are looked at beside the best size
         best = max([(reached, one_step), *peaks], key=lambda b: b[0])[1]
         edges = [(int(i), float(scale[j]), False) for j, i in enumerate(index[:_LINES]) if local[j]]
@@ -178,10 +178,10 @@ def _large(problem: Problem, x: np.ndarray, effect: Effect, count: int) -> list[
     index = problem.layout.of(effect)
     scale, sided = scales(effect), sides(effect)
     found: list[tuple[float, np.ndarray]] = []
-    for j, position in enumerate(index[:_SWEPT]):
+    for j in sizes(effect)[:_SWEPT]:
         for size in LARGE[LARGE > 0] if sided[j] else LARGE:
             moved = x.copy()
-            moved[position] += size * scale[j]
+            moved[index[j]] += size * scale[j]
             start = swept(problem, moved, problem.compiled.by_cluster)
             if start is moved:
                 return []

@@ -7,9 +7,10 @@ from dataclasses import replace
 from typing import Final
 
 import numpy as np
+from jaxtyping import Float
 
 from dtprob.gap.fitting.active import Active
-from dtprob.gap.fitting.newton import System, positive
+from dtprob.gap.fitting.newton import System
 from dtprob.gap.fitting.plausible import plausible_spread
 from dtprob.gap.model.problem import Problem
 
@@ -33,10 +34,7 @@ def respread(
     than a factor of 3.
     """
     spread, changes = dict(active.spread), dict[str, float]()
-    own = np.zeros(problem.dimension)
-    own[active.global_index] = np.diag(np.linalg.inv(positive(system.curvature)))
-    if active.local_index.size:
-        own[active.local_index] = np.einsum("cii->ci", np.linalg.inv(positive(system.local)))
+    own = _variances(problem, active, system)
     for effect in (e for e in active.effects if e.kind == "variance"):
         name, block = effect.name, problem.field_of(effect)
         sd = active.spread[name]
@@ -50,3 +48,16 @@ def respread(
         changes[name] = float(np.log(spread[name] / sd))
     change = max(abs(c) for c in changes.values())
     return replace(active, spread=spread), change, {} if latest else changes
+
+
+def _variances(problem: Problem, active: Active, system: System) -> Float[np.ndarray, " dimension"]:
+    """Posterior variance of each free coordinate, all others as uncertain as they are."""
+    found = np.zeros(problem.dimension)
+    local, schur = system.eliminated()
+    shared = np.linalg.inv(schur) if np.isfinite(schur).all() else np.zeros_like(schur)
+    found[active.global_index] = np.diag(shared)
+    if active.local_index.size:
+        pull = np.linalg.solve(local, np.swapaxes(system.cross, 1, 2))
+        alone = np.einsum("cii->ci", np.linalg.inv(local))
+        found[active.local_index] = alone + np.einsum("cij,jk,cik->ci", pull, shared, pull)
+    return found

@@ -97,8 +97,8 @@ def _predicted(problem: Problem, part: Fit, held: np.ndarray) -> _Predicted:
     score = np.einsum("cmi,cm->ci", local, e) + slope[places]
     unknown = np.concatenate([w[..., :n] @ _root(part.covariance), random], axis=-1)
     left = unknown - np.einsum("cmi,cki,ckj->cmj", pull, local, unknown)
-    noise = 1 - 2 * np.einsum("cmi,cmi->cm", pull, local)
-    noise = noise + np.einsum("cmi,cij,cmj->cm", pull, np.einsum("cki,ckj->cij", local, local), pull)
+    # what a refit leaves of noise and of the prior's own spread together, whose rows have variance 1 + local prior local'
+    noise = 1 - np.einsum("cmi,cmi->cm", pull, local)
     variance = np.maximum(noise + (left**2).sum(-1), 0.0)
     return _Predicted(
         e - np.einsum("cmi,ci->cm", pull, score), np.sqrt(variance), _swing(problem, unknown, held)

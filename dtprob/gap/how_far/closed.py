@@ -241,7 +241,7 @@ def closed_fraction(
         draws: bootstrap draws.
     """
     gain, totals = _gains(before, after, key, draws)
-    if gain.sum() <= 0 or np.quantile(totals, 0.05) <= 0:
+    if not (np.isfinite(gain).all() and gain.sum() > 0 and np.quantile(totals, 0.05) > 0):
         return None
     return share(before, after, best, key, draws)
 

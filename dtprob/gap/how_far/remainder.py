@@ -97,7 +97,9 @@ def model_remainder(
     taken = sorted((n for n in named if n in full.effects), key=lambda n: -named[n].evidence)
     if not taken:
         return None
-    parts = list(closed.fold_fits(wider, full, np.sum([i * f.held for i, f in enumerate(folds)], axis=0)))
+    refitted = closed.fold_fits(wider, full, np.sum([i * f.held for i, f in enumerate(folds)], axis=0))
+    # the causes are as hard to choose as they were, though here others of their families are no candidates
+    parts = [part._replace(charged=fold.charged) for part, fold in zip(refitted, folds, strict=True)]
     after = closed.judged(wider, parts)
     reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
     size = sum(shared_weights(wider, full, n) for n in taken)

@@ -13,9 +13,12 @@ from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.rewriting import with_effects
 from dtprob.gap.diagnosis import Size
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.active import activate
+from dtprob.gap.fitting.bounded import Bounded, bounded_draws
+from dtprob.gap.fitting.density import system_at
 from dtprob.gap.fitting.determined import deviation_of_spread
 from dtprob.gap.fitting.informed import informed
-from dtprob.gap.fitting.plausible import nulls, plausible_spread, scales, sides
+from dtprob.gap.fitting.plausible import limits, nulls, plausible_spread, scales
 from dtprob.gap.model.problem import Problem
 from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.inference.laplace import Laplace
@@ -56,17 +59,30 @@ def _posterior(
     """
     means = [e for e in effects if e.kind == "mean"]
     if isinstance(engine, Laplace):
-        position = {int(i): j for j, i in enumerate(fitted.global_index)}
-        noise = np.asarray(jax.random.normal(key, (engine.draws, len(fitted.global_index))))
-        moved = fitted.x[fitted.global_index] + noise @ np.linalg.cholesky(fitted.covariance).T
-        moved = np.maximum(moved, _lowest(problem, means, fitted))
-        names = [e.site_name(p.name) for e in means for p in e.parameters]
-        return {n: moved[:, [position[int(i)] for i in problem.layout[n].index[0]]] for n in names}
+        return _normal(problem, fitted, means, key, engine.draws)
     fields = _fields_at(problem, fitted, effects)
     started = _start_at(engine, {**problem.initial(fitted.x, means), **fields})
     model = with_effects(informed(problem.model, problem.known), effects)
     posterior = started(key, model, problem.data, options=LATENTS_ONLY)
     return {name: np.asarray(draws) for name, draws in posterior.draws.items()}
+
+
+def _normal(
+    problem: Problem, fitted: fitting.Fit, means: Sequence[Effect], key: jax.Array, count: int
+) -> dict[str, np.ndarray]:
+    """Draws of the refit's own normal approximation, within what the effects' priors allow."""
+    active = activate(problem, fitted.effects, spread=fitted.spread)
+    gradient = system_at(problem, active, fitted.x).gradient
+    pushed = fitting.pushed_out(problem, active, fitted.x, gradient)
+    mean = fitted.x[fitted.global_index] + fitted.covariance @ pushed
+    low, high = np.full(len(mean), -np.inf), np.full(len(mean), np.inf)
+    for effect in means:
+        place = np.searchsorted(fitted.global_index, problem.layout.of(effect))
+        low[place], high[place] = limits(effect)
+    rng = np.random.default_rng(np.asarray(jax.random.bits(key, (4,))))
+    draws = bounded_draws(Bounded(mean, fitted.covariance, low, high), count, rng)
+    names = [e.site_name(p.name) for e in means for p in e.parameters]
+    return {n: draws[:, np.searchsorted(fitted.global_index, problem.layout[n].index[0])] for n in names}
 
 
 def _fields_at(problem: Problem, fitted: fitting.Fit, effects: Sequence[Effect]) -> dict[str, np.ndarray]:
@@ -80,15 +96,6 @@ def _fields_at(problem: Problem, fitted: fitting.Fit, effects: Sequence[Effect])
             at = problem.layout.part(fitted.x, name) if parameter.is_place else spread
             found[name] = np.broadcast_to(at, parameter.shape)
     return found
-
-
-def _lowest(problem: Problem, means: Sequence[Effect], fitted: fitting.Fit) -> np.ndarray:
-    """The smallest value of each global coordinate: the null of one-sided parameters."""
-    lowest = np.full(problem.dimension, -np.inf)
-    for effect in means:
-        index = problem.layout.of(effect)
-        lowest[index] = np.where(sides(effect), nulls(effect), -np.inf)
-    return lowest[fitted.global_index]
 
 
 def _start_at(engine: AbstractEngine, initial: Mapping[str, Any]) -> AbstractEngine:

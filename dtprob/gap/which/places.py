@@ -142,7 +142,7 @@ def _finer(
 
 def _grid(effect: Effect, most: int) -> _Grid:
     """Combinations (place, parameter) of the places that are tried, the size at its null, and how far apart they are."""
-    values = [np.array(p.tried or (p.null,)) for p in effect.parameters]
+    values = [np.array(p.tried or (p.null,)) for p in effect.parameters for _ in range(p.size)]
     gaps = [np.gradient(v) if len(v) > 1 else np.zeros(1) for v in values]
     points, spacing = (
         np.stack(np.meshgrid(*v, indexing="ij"), -1).reshape(-1, len(v)) for v in (values, gaps)
@@ -185,11 +185,16 @@ def _tail(t: Float[np.ndarray, " n"], freedom: int, *, one_sided: bool) -> Float
 
 def _at(effect: Effect, point: Float[np.ndarray, " parameter"]) -> Effect:
     """The effect with its places here."""
-    moved = iter(np.where(places(effect), point, nulls(effect)).tolist())
-    return replace(effect, parameters=tuple(_moved(p, next(moved)) for p in effect.parameters))
+    moved = np.split(
+        np.where(places(effect), point, nulls(effect)), np.cumsum([p.size for p in effect.parameters])
+    )
+    parameters = (_moved(p, entries) for p, entries in zip(effect.parameters, moved, strict=False))
+    return replace(effect, parameters=tuple(parameters))
 
 
-def _moved(parameter: Parameter, to: float) -> Parameter:
+def _moved(parameter: Parameter, entries: Float[np.ndarray, " entry"]) -> Parameter:
+    """The parameter at its best place; one that is not tried has no better place than it had."""
     if not parameter.tried:
         return parameter
+    to = float(entries[0])
     return replace(parameter, prior=dist.Normal(to, float(parameter.scale)), null=to)

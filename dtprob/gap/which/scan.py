@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from dtprob.effects.effect import Effect
-from dtprob.gap.fitting.plausible import WHOLE, nulls, scales, sides
+from dtprob.gap.fitting.plausible import WHOLE, nulls, scales, sides, sizes
 from dtprob.gap.fitting.sweep import combined, elsewhere
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.directions import Surroundings, surroundings
@@ -68,7 +68,7 @@ def scan(
         around = surroundings(problem, anchor)
         here = float(problem.compiled.shifted(anchor, {}, 1)[0].sum())
         probed = _likelihoods(problem, around, small)
-        bent = [e for e in means if _is_bent(probed[e.name] - here, sides(e)[:_SCANNED])]
+        bent = [e for e in means if _is_bent(probed[e.name] - here, sides(e)[sizes(e)[:_SCANNED]])]
         lines, likelihoods = _scanned(problem, around, bent, np.linspace(-_REACH, _REACH, _COARSE))
         waves = [e for e in bent if _is_wave(likelihoods[e.name])]
         for part, values in zip(_scanned(problem, around, waves, _FINE), (lines, likelihoods), strict=True):
@@ -97,7 +97,9 @@ def scan_anew(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str
         return {}
     points = [x, *(point for point, _ in others)]
     here = float(np.fmax.reduce([by_cluster(x), *(terms for _, terms in others)]).sum())
-    lines = {e.name: _lines(e, np.array([WHOLE] if sides(e).all() else [-WHOLE, WHOLE])) for e in effects}
+    lines = {
+        e.name: _lines(e, np.array([WHOLE] if sides(e)[sizes(e)].all() else [-WHOLE, WHOLE])) for e in effects
+    }
     best = {name: np.full((len(line), problem.n_cluster), -np.inf) for name, line in lines.items()}
     chosen = {name: np.zeros(terms.shape, int) for name, terms in best.items()}
     for i, point in enumerate(points):
@@ -158,10 +160,10 @@ def _is_wave(values: np.ndarray) -> bool:
 
 
 def _lines(effect: Effect, offsets: np.ndarray) -> np.ndarray:
-    """Flat parameters (trial, parameter): each of the first few moved by offsets, in prior standard deviations."""
+    """Flat parameters (trial, parameter): each of the first few sizes moved by offsets, in prior standard deviations."""
     null, scale, sided = nulls(effect), scales(effect), sides(effect)
     lines = []
-    for j in range(min(len(null), _SCANNED)):
+    for j in sizes(effect)[:_SCANNED]:
         line = np.repeat(null[None], len(offsets), axis=0)
         line[:, j] += (np.abs(offsets) if sided[j] else offsets) * scale[j]
         lines.append(line)

@@ -124,16 +124,19 @@ def screen(
     replicate_p = _smallest(
         null_p.min(axis=1, initial=1.0), *(found.replicate_p for found in placed.values())
     )
-    tests = effective_tests(_smallest(replicate_p, tested.replicates.min(axis=1, initial=1.0)))
+    together = _smallest(replicate_p, tested.replicates.min(axis=1)) if fields else replicate_p
+    tests = effective_tests(together)
     times = drawn.most(settings.site_times)
     if times > 1 and _is_open(tested.smallest, mean_p, tests, settings):
         tested = tests_of_fields(problem, around, fields, more(drawn, times), placed)
-        tests = effective_tests(replicate_p) + effective_tests(tested.replicates.min(axis=1))
+        of_means = effective_tests(replicate_p) if means else 0.0
+        tests = of_means + effective_tests(tested.replicates.min(axis=1))
     smallest = np.concatenate([mean_p[0], tested.smallest])
     names = [e.name for e in (*means, *fields)]
     order = np.array([names.index(c.name) for c in candidates], int)
     above, below = (any_of(p, tests) for p in (mean_p[0], stats.norm.cdf(mean_z[0])))
     opposite, beyond = _excluded(scores, above, below, placed, settings)
+    reach = np.sqrt(np.einsum("cmg,cmg->g", projection.columns, projection.columns))
     log_bf = np.concatenate([scores.log_bayes_factor, tested.log_bayes_factor])
     return Screening(
         names=tuple(c.name for c in candidates),
@@ -142,7 +145,7 @@ def screen(
         adjusted=any_of(smallest, tests)[order],
         log_bayes_factor=log_bf[order],
         step={e.name: scores.step(k) for k, e in enumerate(means)},
-        absorbed_by=tuple(_absorbed(problem, fitted, scores, c) for c in candidates),
+        absorbed_by=tuple(_absorbed(problem, fitted, scores, reach, c) for c in candidates),
         opposite=tuple(c.name in opposite for c in candidates),
         beyond=tuple(beyond.get(c.name) for c in candidates),
         detectable=tuple(_detectable(scores, c, settings) for c in candidates),
@@ -185,8 +188,10 @@ def _is_open(fields: np.ndarray, means: np.ndarray, tests: float, settings: Sett
     return is_open and bool(least < means.min(initial=1.0))
 
 
-def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Effect) -> str | None:
-    """The nuisance that explains nearly all of an effect's own information."""
+def _absorbed(
+    problem: Problem, fitted: fitting.Fit, scores: Scores, reach: np.ndarray, effect: Effect
+) -> str | None:
+    """The nuisance that explains nearly all of an effect's own information; `reach`: how far each moves predictions."""
     if effect.kind != "mean":
         return None
     k = [e.name for e in scores.effects].index(effect.name)
@@ -203,7 +208,7 @@ def _absorbed(problem: Problem, fitted: fitting.Fit, scores: Scores, effect: Eff
     owners = np.concatenate([[i] * b.size for i, b in enumerate(blocks)]) if blocks else np.zeros(0, int)
     if not len(owners):
         return "the clusters' own parameters"
-    share = np.abs(scores.coefficients[:, group]).sum(1)
+    share = np.abs(scores.coefficients[:, group]) @ scales(effect) * reach
     return blocks[int(owners[int(np.argmax(share))])].name
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from scipy import stats
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting.base import fit_base
@@ -68,3 +69,37 @@ def test_the_spread_is_known_as_its_exact_posterior_says(shape, axis):
     else:
         assert told == pytest.approx(found.spread["shadowing"] / np.sqrt(2 * READINGS), rel=0.35)
         assert shared_weights(problem, found, "shadowing") == pytest.approx(READINGS, abs=1.1)
+
+
+def group_shares(group, y=None):
+    """Links that each have a level, in groups that may have one, too."""
+    with numpyro.plate("link", len(group), dim=-2):
+        level = numpyro.sample("level", dist.Normal(0.0, 3.0))
+        with numpyro.plate("reading", 4, dim=-1):
+            mean = numpyro.deterministic("mean", level + jnp.zeros((len(group), 4)))
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+@pytest.mark.parametrize("true", [1.5, 2.0, 3.0])
+def test_the_spread_that_clusters_share_is_that_of_the_largest_marginal_likelihood(true):
+    """What each link has of its own is as unknown as it is: held at its mode it hid a spread of half its size."""
+    group = np.repeat(np.arange(20), 5)
+    rng = np.random.default_rng(2)
+    levels = 3.0 * rng.normal(size=100) + true * rng.normal(size=20)[group]
+    y = levels[:, None] + rng.normal(size=(100, 4))
+    field = Effect(
+        "groups",
+        {"mean": lambda value, p, context: value + p["scale"] * p["field"][context["group"], None]},
+        (Parameter("scale", dist.HalfNormal(5.0)),),
+        kind="variance",
+        field_shape=lambda value, context: (20,),
+        requires=("group",),
+    )
+    problem = Problem(group_shares, {"group": jnp.asarray(group), "y": jnp.asarray(y)}, [field])
+    problem = problem.with_live(["groups"])
+    found = fit(problem, problem.null(), ("groups",))
+    means = y.reshape(20, 5, 4).mean(axis=(1, 2))
+    spreads = np.linspace(0.01, 6, 600)
+    variance = spreads[:, None] ** 2 + (9 + 1 / 4) / 5
+    best = spreads[np.argmax(stats.norm.logpdf(means, 0, np.sqrt(variance)).sum(axis=1))]
+    assert found.spread["groups"] == pytest.approx(best, rel=0.02, abs=0.02)

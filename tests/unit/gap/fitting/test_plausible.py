@@ -1,20 +1,25 @@
 """Evidence with the scale of the prior mixed, against quadrature."""
 
+import jax.numpy as jnp
 import numpy as np
+import numpyro
 import numpyro.distributions as dist
 import pytest
 from numpyro.distributions.transforms import AffineTransform
-from scipy import integrate, stats
+from scipy import integrate, special, stats
 
 from dtprob.effects.effect import Effect, Parameter
+from dtprob.gap.fitting.fit import fit
 from dtprob.gap.fitting.plausible import (
     SCALES,
+    limits,
     log_bayes_factor,
     mixing_gain,
     nulls,
     scales,
     sides,
 )
+from dtprob.gap.model.problem import Problem
 
 
 def quadrature(information, score, scale, low=-np.inf):
@@ -62,11 +67,11 @@ def test_the_gain_over_the_largest_scale(one_sided):
     information, score, scale = np.array([[50.0]]), np.array([9.0]), np.array([0.7])
     precision = information + np.diag(scale**-2.0)
     mode = np.linalg.solve(precision, score)
-    found = mixing_gain(np.linalg.inv(precision), mode, scale, one_sided=one_sided)
+    found = mixing_gain(np.linalg.inv(precision), mode, scale, sides=np.array([one_sided]))
     mixed = log_bayes_factor(information, score, scale, one_sided=one_sided)
     widest = 0.5 * (score @ mode - np.log(1 + information[0, 0] * scale[0] ** 2))
     if one_sided:
-        widest += np.log(2) + stats.norm.logcdf(score[0] / np.sqrt(precision[0, 0]))
+        widest += np.log(2)  # the density of the prior at the mode is twice that of a normal one
     assert found == pytest.approx(mixed - widest, abs=1e-9)
 
 
@@ -94,8 +99,9 @@ def test_flat_sizes_of_an_effect():
 def test_a_size_with_a_place_is_one_sided_as_one_without(estimate):
     covariance, scale = np.diag([0.3, 0.04]) ** 2, np.array([2.0, 0.5])
     places = np.array([False, True])
-    both = mixing_gain(covariance, np.array([estimate, 0.2]), scale, one_sided=True, places=places)
-    alone = mixing_gain(covariance[:1, :1], np.array([estimate]), scale[:1], one_sided=True)
+    sides = np.array([True, False])
+    both = mixing_gain(covariance, np.array([estimate, 0.2]), scale, sides=sides, places=places)
+    alone = mixing_gain(covariance[:1, :1], np.array([estimate]), scale[:1], sides=sides[:1])
     np.testing.assert_allclose(both, alone, rtol=1e-10)
     assert mixing_gain(covariance, np.array([estimate, 0.2]), scale, places=places) != pytest.approx(
         both, abs=0.03
@@ -146,3 +152,44 @@ def test_how_far_a_prior_without_moments_puts_a_size():
     assert float(Parameter("p", dist.Pareto(1.0, 1.5)).scale) == pytest.approx(
         2 ** (1 / 1.5) / 0.6745, rel=0.05
     )
+
+
+@pytest.mark.parametrize("shift", [-1.0, 0.0, 0.5])
+def test_evidence_of_sizes_that_cannot_be_below_their_null_is_exact(shift):
+    """Of a size for each of 24 links: half of them, or nearly all, are pushed against the null."""
+    per_link, scale = 5, 3.0
+    y = np.random.default_rng(0).normal(shift, 1.0, (24, per_link))
+    each = Effect(
+        "each",
+        {"m": lambda value, p, _: value + p["s"][:, None]},
+        (Parameter("s", dist.HalfNormal(scale).expand([24]).to_event(1)),),
+    )
+    problem = Problem(readings, {"y": jnp.asarray(y)}, [each]).with_live(["each"])
+    base, found = (fit(problem, problem.null(), names) for names in ((), ("each",)))
+    u, widths = y.sum(axis=1), scale * SCALES[:, None]
+    spread = 1 + widths**2 * per_link
+    above = np.log(2) + stats.norm.logcdf(u * widths / np.sqrt(spread))
+    exact = (0.5 * (widths**2 * u**2 / spread - np.log(spread)) + above).sum(axis=1)
+    expected = special.logsumexp(exact) - np.log(len(SCALES))
+    assert found.log_evidence - base.log_evidence == pytest.approx(expected, abs=1e-6)
+
+
+def readings(y=None):
+    with numpyro.plate("link", 24, dim=-2), numpyro.plate("row", 5, dim=-1):
+        mean = numpyro.deterministic("m", jnp.zeros((24, 5)))
+        numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+
+def test_limits_of_sizes():
+    effect = Effect(
+        "both",
+        {"mean": lambda v, p, c: v},
+        (
+            Parameter("loss", dist.HalfNormal(0.3)),
+            Parameter("share", dist.Uniform(0.0, 1.0)),
+            Parameter("shift", dist.Normal(0.0, 2.0).expand([2]).to_event(1)),
+        ),
+    )
+    low, high = limits(effect)
+    np.testing.assert_array_equal(low, [0, 0, -np.inf, -np.inf])
+    np.testing.assert_array_equal(high, [np.inf, 1, np.inf, np.inf])

@@ -222,3 +222,15 @@ def test_local_coordinates_follow_the_names_of_clusters(order):
     covariance = SIGMA**2 * np.eye(5) + 1.0
     expected = [stats.multivariate_normal(np.zeros(5), covariance).logpdf(row) for row in y]
     np.testing.assert_allclose(marginal(problem, fitted), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize("lost", [-np.inf, np.nan])
+def test_no_fraction_of_what_is_not_finite(lost):
+    before, after = np.zeros(8), np.ones(8)
+    for one in (before, after):
+        whole = one.copy()
+        whole[0] = lost
+        pair = (whole, after) if one is before else (before, whole)
+        with np.errstate(invalid="ignore"):
+            found = closed.closed_fraction(held(pair[0]), held(pair[1]), Floor(8.0, 9.0), jax.random.key(0))
+        assert found is None

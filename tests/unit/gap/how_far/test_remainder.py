@@ -342,3 +342,22 @@ def test_errors_of_outcomes_are_not_judged(name):
         assert found.error_ratio > 2
     else:
         assert found.error_ratio is None
+
+
+def own_levels(y=None):
+    with numpyro.plate("link", y.shape[0], dim=-2):
+        level = numpyro.sample("level", dist.Normal(0.0, 0.7))
+        with numpyro.plate("sample", y.shape[1], dim=-1):
+            numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+
+@pytest.mark.parametrize("readings", [1, 2, 4])
+def test_a_right_model_with_levels_of_its_own_is_calibrated(readings):
+    """A level that its prior knows leaves more of a reading than one that is refitted without it."""
+    rng = np.random.default_rng(readings)
+    y = 0.7 * rng.normal(size=(400, 1)) + rng.normal(size=(400, readings))
+    problem = Problem(own_levels, {"y": jnp.asarray(y)}, ())
+    fitted = fitting.fit(problem, problem.null())
+    found = calibration(problem, list(closed.fold_fits(problem, fitted, closed.folds(400, 2))))
+    assert found.coverage == pytest.approx(0.9, abs=3.5 * np.sqrt(0.09 / 400))
+    assert found.error_ratio == pytest.approx(1.0, abs=3.5 / np.sqrt(2 * 400))

@@ -70,3 +70,36 @@ def test_entries_are_called_as_the_parameter_says(labels, names):
     prior = dist.Normal(0.0, 1.0).expand([3]).to_event(1)
     found = _sizes(Parameter("gain", prior, unit="Np", labels=labels), np.zeros((8, 3)), prefix="")
     assert [one.name for one in found] == names
+
+
+def test_sizes_stay_within_what_their_priors_allow():
+    """A share that data push to its whole, and a loss that they push against its null, as a sampler finds them."""
+
+    def two(group, y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+        with numpyro.plate("row", len(group)):
+            mean = numpyro.deterministic("mean", level + 0.0 * group)
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+    rng = np.random.default_rng(1)
+    group = np.arange(60) % 3
+    y = 1.25 * (group == 1) - 0.4 * (group == 2) + rng.normal(size=60)
+    effect = Effect(
+        "both",
+        {
+            "mean": lambda value, p, context: (
+                value + p["share"] * (context["group"] == 1) + p["loss"] * (context["group"] == 2)
+            )
+        },
+        (Parameter("share", dist.Uniform(0.0, 1.0)), Parameter("loss", dist.HalfNormal(3.0))),
+    )
+    problem = Problem(two, {"group": jnp.asarray(group), "y": jnp.asarray(y)}, [effect]).with_live(["both"])
+    found = fit(problem, problem.null(), ["both"])
+    normal, exact = (
+        {size.name: size for size in confirm(problem, found, [effect], jax.random.key(0), engine)[0]}
+        for engine in (Laplace(draws=4000), NUTS(warmup=500, draws=1500, chains=2))
+    )
+    assert normal["share"].high <= 1.0
+    for name in ("share", "loss"):
+        for end in ("low", "mean", "high"):
+            assert getattr(normal[name], end) == pytest.approx(getattr(exact[name], end), abs=0.1)

@@ -3,7 +3,9 @@
 from dataclasses import replace
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import numpyro
 import numpyro.distributions as dist
 import pytest
 from scipy import stats
@@ -263,3 +265,35 @@ def test_a_random_field_acts_at_one_site_where_it_is_looked_for(sites, tried):
             (Parameter("c", dist.HalfNormal()), at),
             kind="variance",
         )
+
+
+def test_a_place_of_several_entries_stands_beside_one_that_is_tried():
+    effect = Effect(
+        "step",
+        {
+            "mean": lambda value, p, context: (
+                value
+                + p["db"]
+                * jax.nn.sigmoid((context["x"] - p["edge"]) / (0.2 + 0.01 * jnp.sum(p["width"] ** 2)))
+            )
+        },
+        (
+            Parameter("db", dist.HalfNormal(2.0)),
+            Parameter("width", dist.Normal(0.0, 1.0).expand([2]).to_event(1), is_place=True),
+            Parameter("edge", dist.Normal(0.0, 1.0), is_place=True, tried=(-0.5, 0.0, 0.5)),
+        ),
+    )
+
+    def steps(x, y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+        with numpyro.plate("row", len(x)):
+            mean = numpyro.deterministic("mean", level + 0.0 * x)
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+    x = np.linspace(-1, 1, 200)
+    y = 1.5 * (x > 0.5) + np.random.default_rng(0).normal(size=200)
+    problem = Problem(steps, {"x": jnp.asarray(x), "y": jnp.asarray(y)}, [effect])
+    base = fitting.fit(problem, problem.null())
+    seen = view(problem, base, jax.random.key(0), Settings(replicates=100, site_replicates=19), located=False)
+    edge = next(e for e in seen.problem.effects if e.name == "step").parameters[2]
+    assert edge.null == pytest.approx(0.5, abs=0.3)

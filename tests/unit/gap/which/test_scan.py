@@ -44,3 +44,18 @@ def test_a_wrong_carrier_is_found_between_the_even_sizes(offset):
     start[index] = found.parameters
     fitted = fitting.fit(wider, start, ["carrier"])
     assert fitted.x[index] == pytest.approx(offset, abs=0.1)
+
+
+def test_sizes_are_scanned_whatever_stands_before_them():
+    """Places do nothing as long as the size is at its null."""
+    size = CARRIER.parameters[0]
+    places = tuple(Parameter(name, dist.Normal(0.0, 1.0), is_place=True) for name in ("east", "north"))
+    delay = np.random.default_rng(0).uniform(0.0, 0.2, 120)
+    seen = np.cos(-2 * np.pi * 31.0 * delay - 1.0)
+    data = {"delay": jnp.asarray(delay), "seen": jnp.asarray(seen)}
+    gains = []
+    for parameters in ((size, *places), (*places, size)):
+        problem = Problem(waves, data, [Effect("carrier", CARRIER.rewrites, parameters)])
+        base = fitting.fit(problem, problem.null())
+        gains.append(scan(problem, base.x, ["carrier"])["carrier"].gain)
+    assert gains[1] == pytest.approx(gains[0], rel=1e-6)

@@ -87,3 +87,48 @@ def test_a_refit_finds_the_mode_under_any_prior(prior):
 
     best = optimize.minimize(loss, [0.7, 2.0], method="Nelder-Mead", options={"xatol": 1e-6, "fatol": 1e-8}).x
     assert found.x[problem.layout.indices(["b", "nearly.by"])] == pytest.approx(best, abs=2e-3)
+
+
+@pytest.mark.parametrize("unit", [1.0, 1000.0])
+def test_what_absorbs_an_effect_does_not_depend_on_units(unit):
+    def tilted(t, y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 100.0))
+        tilt = numpyro.sample("tilt", dist.Normal(0.0, 100.0 / unit))
+        with numpyro.plate("row", len(t)):
+            mean = numpyro.deterministic("mean", level + tilt * unit * t)
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+    t = np.linspace(-1, 1, 300)
+    effect = Effect(
+        "nearly", {"mean": lambda v, p, c: v + p["by"] * (c["t"] + 0.05)}, (Parameter("by", dist.Normal()),)
+    )
+    y = np.random.default_rng(0).normal(size=300)
+    problem = Problem(tilted, {"t": jnp.asarray(t), "y": jnp.asarray(y)}, [effect])
+    base = fitting.fit(problem, problem.null())
+    seen = view(problem, base, jax.random.key(0), Settings(replicates=100, site_replicates=19), located=False)
+    assert seen.screening.absorbed_by == ("tilt",)
+
+
+def rare(y=None):
+    with numpyro.plate("row", 60):
+        mean = numpyro.deterministic("mean", jnp.full(60, 0.2))
+        numpyro.sample("y", dist.Poisson(mean), obs=y)
+
+
+def test_all_replicates_tell_how_rare_a_score_is():
+    """Two events in one row of rate .2 come once in 57; ninety-nine replicates take it for once in thousands."""
+    effect = Effect(
+        "first",
+        {"mean": lambda value, p, _: value + p["s"] * (jnp.arange(60) == 0)},
+        (Parameter("s", dist.HalfNormal(1.0)),),
+    )
+    y = np.random.default_rng(3).poisson(0.2, 60)
+    y[0] = 2
+    problem = Problem(rare, {"y": jnp.asarray(y)}, [effect])
+    base = fitting.fit(problem, problem.null())
+    settings = Settings()
+    adjusted = [
+        view(problem, base, jax.random.key(k), settings, located=False).screening.adjusted[0]
+        for k in range(6)
+    ]
+    assert sum(p <= settings.level / 2 for p in adjusted) <= 3
