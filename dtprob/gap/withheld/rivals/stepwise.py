@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.refit import refit, starting_points
+from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.withheld.rivals.claim import Claim
@@ -65,14 +65,15 @@ def _refitted(seen: Look, settings: Settings) -> Trials:
         step = seen.scores.step(means.index(name)) if name in means else None
         starts = starting_points(problem, start.x, effects[name], step, settings)
         fits[name] = refit(problem, start, effects[name], starts)
-    return Trials(problem, fits)
+    return Trials(problem, {**fits, **polished(problem, start, fits, settings.polished)})
 
 
 def forward(seen: Look, criterion: Criterion, key: jax.Array, settings: Settings) -> Claim:
     """Name the set where the criterion stops; rank by the criterion of single effects, then by first-order gain.
 
-    Candidates that promise most to first order, at one nat per parameter, are refitted as a diagnosis does it. The alarm is
-    the largest gain of one effect less its penalty, to first order, so that it can be had of replicates.
+    Candidates that promise most to first order, at one nat per parameter, are refitted as a diagnosis does it, the best of
+    them freed from local optima. The alarm is the largest gain of one effect less its penalty, to first order, so that it
+    can be had of replicates.
 
     Args:
         seen: the base fit.
