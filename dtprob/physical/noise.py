@@ -51,22 +51,23 @@ class Noise:
 
     def mean_power(self, shape: tuple[int, ...]) -> float:
         """Mean power over all entries, rounding included."""
-        background = self.power * (1 + self.impulse_probability * self.impulse_ratio)
-        return float(np.mean(np.broadcast_to(background + self._rounding(), shape)))
+        impulses = self.power * self.impulse_probability * self.impulse_ratio
+        return float(np.mean(np.broadcast_to(self.level + impulses, shape)))
 
     def information(self, shape: tuple[int, ...]) -> float:
         """Twice the expected gain in log-likelihood of this law over white noise of the best level."""
         count = int(np.prod(shape))
-        power = np.broadcast_to(self.power + self._rounding(), shape)
+        power = np.broadcast_to(self.level, shape)
         total = power_information(power)
         total += impulse_information(self.impulse_probability, self.impulse_ratio, count)
         if self.colour is not None:
             total += colour_information(self.colour, count // len(self.colour))
         return total
 
-    def _rounding(self) -> Float[np.ndarray, "..."]:
-        """Power of the rounding error, uniform in a square of side `step`."""
-        return np.zeros(1) if self.step is None else self.step**2 / 6
+    @property
+    def level(self) -> Float[np.ndarray, "#link #snapshot #rx_antenna #tx_antenna #subcarrier"]:
+        """Power of each entry between impulses; the rounding error is uniform in a square of side `step`."""
+        return self.power if self.step is None else self.power + self.step**2 / 6
 
 
 def circular(rng: np.random.Generator, shape: tuple[int, ...]) -> Complex[np.ndarray, "..."]:

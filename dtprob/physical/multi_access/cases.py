@@ -96,9 +96,10 @@ def _cells(network: Network, faults: Sequence[_Active]) -> dict[str, list[int]]:
     sound = network.arrival[:, 0]
     before = np.ones(network.devices, int)
     change = sum(
-        abs(one.fault.arrivals(sound, Past(AFTER, 1.0, before, one.fault.start(one.size)), one.size) - sound)
+        abs(one.fault.arrivals(sound, Past(slot, slot / AFTER, before), one.size) - sound)
         for one in faults
         if one.fault.arrivals is not None
+        for slot in range(AFTER)
     )
     return touched(np.asarray(change).sum(axis=1), ("cluster",), sum(one.lambda_ for one in faults))
 
