@@ -130,7 +130,7 @@ def _periodic_gain(rng: np.random.Generator, _runs: Runs) -> Fault:
 
 def _bursts(rng: np.random.Generator, _runs: Runs) -> Fault:
     """A stranger's bursts add power: two in each run, anywhere."""
-    start = rng.integers(0, STEPS - _BURST, (RUNS, 2, 1))
+    start = rng.integers(0, STEPS - _BURST + 1, (RUNS, 2, 1))
     steps = np.arange(STEPS)
     inside = ((steps >= start) & (steps < start + _BURST)).any(axis=1)
     return Fault("bursts", None, "dB", _LARGEST_DB, shifted(1.0 * inside))

@@ -34,6 +34,14 @@ def test_every_fault_keeps_a_law_and_does_nothing_at_size_zero(track, made, fami
     assert information(bench, fault.change(bench.law, 0.3 * fault.limit)) > 1.0
 
 
+def test_bursts_are_anywhere_in_a_run():
+    hit = np.zeros(fading.STEPS, bool)
+    for seed in range(20):
+        fault = fading.draw(np.random.default_rng(seed), "bursts", RUNS)
+        hit |= np.any(fault.change(RUNS.bench.law, 1.0).mean != RUNS.bench.law.mean, axis=0)
+    assert hit.all()
+
+
 def test_sound_laws_are_what_the_twins_can_fit():
     for bench in (STREETS.bench, RUNS.bench):
         np.testing.assert_allclose(bench.family(bench.start), bench.law.covariance, rtol=1e-9)
