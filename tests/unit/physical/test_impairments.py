@@ -1,5 +1,7 @@
 """Impairments: nothing at size zero, and what physics says elsewhere."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -59,6 +61,13 @@ def test_a_size_changes_something(family, bench, setting):
 def test_the_same_seed_draws_the_same(family, bench, setting):
     first, second = (bench.simulate((drawn(family, setting, 5), 0.01)) for _ in range(2))
     np.testing.assert_array_equal(first.mean, second.mean)
+
+
+def test_a_single_snapshot_has_no_place_for_what_shows_over_time(bench, setting):
+    one = replace(setting, sounding=replace(setting.sounding, snapshot_time=np.zeros(1)))
+    missing = {family for family in FAMILIES if draw(np.random.default_rng(0), family, one) is None}
+    over_time = {"doppler", "sampling_clock_offset", "carrier_frequency_offset", "gain_drift", "pedestrian"}
+    assert missing == over_time
 
 
 def test_an_unknown_family_names_the_nearest(setting):
