@@ -119,6 +119,16 @@ def test_the_same_bytes_again(folder, tmp_path):
     assert all((tmp_path / file).read_bytes() == (folder / file).read_bytes() for file in files)
 
 
+def test_campaigns_are_of_a_kind_that_has_the_families(tmp_path):
+    for family, model in (("handover", "slow_fading"), ("wall", "path_loss")):
+        key = TRACK.generate(tmp_path / family, 9, 1, ("listed",), 60.0, families=(family,))
+        for case_ in json.loads(key.read_text())["cases"]:
+            assert case_["model"] == model
+            assert case_["effects"][0]["family"] == family
+    with pytest.raises(InputError, match="Name more families"):
+        TRACK.generate(tmp_path / "three", 1, 1, ("triple",), 60.0, families=fading.FAMILIES[1:3])
+
+
 def test_wrong_requests(tmp_path):
     assert set(LISTED) | set(FOREIGN) == set(FAMILIES)
     with pytest.raises(InputError, match="families"):
