@@ -11,7 +11,7 @@ from scipy.special import fresnel
 from dtprob.physical.channel import Sounding, path_channels, synthesise, synthesise_wide
 from dtprob.physical.impairment import Channel, Columns, Impairment
 from dtprob.physical.rays import Rays, join
-from dtprob.physical.world import World
+from dtprob.physical.world import World, rotation
 
 
 def phase_error(draw: Float[np.ndarray, "link instant path"], limit: float = 1.0) -> Impairment:
@@ -165,10 +165,12 @@ def atmospheric_attenuation(limit: float = 0.5) -> Impairment:
 
 
 def antenna_pattern(limit: float = 8.0) -> Impairment:
-    """The receiving elements are not isotropic: their field is sin(polar angle) to the power size."""
+    """The receiving elements are not isotropic: their field is sin(angle to their axis) to the power size."""
 
-    def weigh(_world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        sine = np.sqrt(np.clip(1 - rays.arrival[..., 2] ** 2, 1e-12, None))
+    def weigh(world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
+        yaw, pitch, roll = world.rx_turn
+        axis = rotation((yaw, pitch, roll + world.rx_slant))[:, 2]
+        sine = np.sqrt(np.clip(1 - (rays.arrival @ axis) ** 2, 1e-12, None))
         return rays.scaled((sine**size)[:, None])
 
     return Impairment("antenna_pattern", "1", limit, rays=weigh)

@@ -225,6 +225,17 @@ def test_doppler_is_the_change_of_path_lengths(bench, world, trace, sounding):
         assert error(found[:, index], there) < 0.02
 
 
+def test_elements_turn_with_their_array(bench, world):
+    turned = placement.antenna_orientation((0.0, 0.0, 1.0)), np.pi / 2
+    slanted = placement.polarization_mismatch(), np.pi / 2
+    pattern = propagation.antenna_pattern(), 2.0
+    axis = np.array([0.0, -1.0, 0.0])  # of elements that stood upright
+    for one in (turned, slanted):
+        plain, found = bench.simulate(one).rays, bench.simulate(one, pattern).rays
+        expected = 1 - (plain.arrival @ axis) ** 2
+        np.testing.assert_allclose(np.abs(found.gain[:, 0]), np.abs(plain.gain[:, 0]) * expected)
+
+
 def test_a_wide_strip_hides_the_line_of_sight_and_an_edge_halves_it(bench, rays, world):
     link = 0
     away = world.rx_position[link] - world.tx_position[link]
