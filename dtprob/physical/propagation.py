@@ -46,7 +46,7 @@ def doppler(velocity: Float[np.ndarray, "3"], limit: float = 100.0) -> Impairmen
     def drive(_world: World, rays: Rays, sounding: Sounding, size: float) -> Rays:
         return rays.shifted(size * velocity * sounding.snapshot_time[None, :, None])
 
-    return Impairment("doppler", "m/s", limit, rays=drive, detail={"direction": velocity.tolist()})
+    return Impairment("doppler", "m/s", limit, motion=drive, detail={"direction": velocity.tolist()})
 
 
 def blockage(azimuth: float, distance: float, limit: float = 10.0) -> Impairment:
@@ -105,16 +105,23 @@ def extra_path(scatterer: Float[np.ndarray, "3"], limit: float = 100.0) -> Impai
     Size is the root of its cross-section in m. Radar equation for amplitudes,
     a = lambda sqrt(rcs) / ((4 pi)^(3/2) d1 d2).
     """
+    return Impairment(
+        "extra_path",
+        "m",
+        limit,
+        joins=lambda world, rays, _sounding, size: _scattered(world, rays, scatterer, size),
+        detail={"position": scatterer.tolist()},
+    )
 
-    def scatter(world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        tx, rx = world.tx_position, world.rx_position
-        out = np.linalg.norm(scatterer - tx, axis=-1)
-        back = np.linalg.norm(rx - scatterer, axis=-1)
-        gain = size * world.wavelength / ((4 * np.pi) ** 1.5 * out * back)
-        via = np.broadcast_to(scatterer, (world.n_link, 1, 3))
-        return join(rays, gain[:, None].astype(complex), via, tx, rx)
 
-    return Impairment("extra_path", "m", limit, rays=scatter, detail={"position": scatterer.tolist()})
+def _scattered(world: World, rays: Rays, scatterer: Float[np.ndarray, "3"], size: float) -> Rays:
+    """The rays with a path of each link over a scatterer."""
+    tx, rx = world.tx_position, world.rx_position
+    out = np.linalg.norm(scatterer - tx, axis=-1)
+    back = np.linalg.norm(rx - scatterer, axis=-1)
+    gain = size * world.wavelength / ((4 * np.pi) ** 1.5 * out * back)
+    via = np.broadcast_to(scatterer, (world.n_link, 1, 3))
+    return join(rays, gain[:, None].astype(complex), via, tx, rx)
 
 
 def diffuse_scattering(
@@ -152,7 +159,7 @@ def diffuse_scattering(
         flat = np.tile(each.reshape(*each.shape[:2], -1), (1, 1, len(sounding.snapshot_time)))
         return np.concatenate([flat, 1j * flat], axis=1)
 
-    return Impairment("diffuse_scattering", "1", limit, "near_receiver", rays=scatter, spread=spread)
+    return Impairment("diffuse_scattering", "1", limit, "near_receiver", joins=scatter, spread=spread)
 
 
 def atmospheric_attenuation(limit: float = 0.5) -> Impairment:
@@ -204,17 +211,16 @@ def pedestrian(
         limit: of the size.
     """
 
-    def walk(world: World, rays: Rays, sounding: Sounding, size: float) -> Channel:
-        total = synthesise(world, rays, sounding)
-        for index, time in enumerate(sounding.snapshot_time):
-            there = extra_path(start + velocity * time).rays
-            moved = there(world, rays, sounding, size) if there else rays
-            each = path_channels(world, moved, sounding)[:, 0, rays.mask.shape[1] :]
-            total[:, index] += each.sum(axis=1)
-        return total
+    def walk(world: World, rays: Rays, sounding: Sounding, size: float) -> Rays:
+        each = [_scattered(world, rays, start + velocity * time, size) for time in sounding.snapshot_time]
+        gain, unfolded = (
+            np.stack([part[:, min(index, part.shape[1] - 1)] for index, part in enumerate(parts)], axis=1)
+            for parts in ([one.gain for one in each], [one.unfolded for one in each])
+        )
+        return dataclasses.replace(each[0], gain=gain, unfolded=unfolded)
 
     detail = {"position": start.tolist(), "velocity": velocity.tolist()}
-    return Impairment("pedestrian", "m", limit, synthesis=walk, detail=detail)
+    return Impairment("pedestrian", "m", limit, joins=walk, detail=detail)
 
 
 def dispersive_walls(limit: float = 2.0) -> Impairment:

@@ -253,7 +253,7 @@ def test_a_wide_strip_hides_the_line_of_sight_and_an_edge_halves_it(bench, rays,
 
 def test_a_scatterer_obeys_the_radar_equation(bench, rays, world):
     point = np.array([12.0, 3.0, 1.0])
-    scatter = propagation.extra_path(point).rays
+    scatter = propagation.extra_path(point).joins
     assert scatter is not None
     gain = np.abs(scatter(world, rays, bench.sounding, 2.0).gain[:, 0, -1]) ** 2
     out, back = (np.sum((point - place) ** 2, axis=1) for place in (world.tx_position, world.rx_position))
@@ -280,6 +280,38 @@ def test_a_phase_error_leaves_a_path_that_was_joined(bench, setting):
     both = bench.simulate((pole, 1.0), (error_, 0.3)).mean
     apart = bench.simulate((error_, 0.3), (pole, 1.0)).mean
     assert error(both, apart) < RELATIVE
+
+
+@pytest.mark.parametrize("family", ["extra_path", "diffuse_scattering", "pedestrian"])
+@pytest.mark.parametrize("other", ["doppler", "shadowing", "antenna_pattern", "atmospheric_attenuation"])
+def test_the_order_of_drawing_does_not_matter_to_joined_paths(family, other, bench, setting):
+    joined, after = drawn(family, setting), drawn(other, setting, 1)
+    size, more = 0.1 * joined.limit, 0.2 * after.limit
+    first = bench.simulate((joined, size), (after, more)).mean
+    second = bench.simulate((after, more), (joined, size)).mean
+    assert error(first, second) < RELATIVE
+    assert error(first, bench.simulate((joined, size)).mean) > 1e-3
+
+
+def test_a_joined_path_moves_with_the_receiver(bench, sounding):
+    point, velocity = np.array([12.0, 3.0, 1.0]), np.array([3.0, 1.0, 0.0])
+    pole, drive = propagation.extra_path(point), propagation.doppler(velocity)
+    both = bench.simulate((drive, 1.0), (pole, 5.0)).mean
+    moved = both - bench.simulate((drive, 1.0)).mean
+    for index, time in enumerate(sounding.snapshot_time):
+        there = placement.receiver_displacement(velocity)
+        alone = bench.simulate((there, time)).mean[:, 0]
+        expected = bench.simulate((there, time), (pole, 5.0)).mean[:, 0] - alone
+        assert error(moved[:, index], expected) < 0.02
+
+
+def test_a_pedestrian_is_a_pole_that_walks(bench, sounding):
+    start, velocity = np.array([12.0, 3.0, 1.0]), np.array([1.0, -0.5, 0.0])
+    found = bench.simulate((propagation.pedestrian(start, velocity), 5.0)).mean - clean(bench)
+    for index, time in enumerate(sounding.snapshot_time):
+        pole = propagation.extra_path(start + velocity * time)
+        expected = bench.simulate((pole, 5.0)).mean - clean(bench)
+        assert error(found[:, index], expected[:, index]) < 0.02
 
 
 def test_impairments_compose_by_stage(bench, sounding):
