@@ -42,6 +42,16 @@ def test_bursts_are_anywhere_in_a_run():
     assert hit.all()
 
 
+@pytest.mark.parametrize("order", [("deeper_fading", "speed_change"), ("speed_change", "deeper_fading")])
+def test_fading_that_is_deeper_and_faster_is_both(order):
+    law = RUNS.bench.law
+    for family in ("own_level", *order, "gain_drift"):
+        law = fading.draw(np.random.default_rng(0), family, RUNS).change(law, 2.0)
+    late = 0.5 * (1 + np.tanh((np.linspace(0, 1, fading.STEPS) - 0.5) / 0.02))
+    both = RUNS.faded(RUNS.fading * (1 + 2 * late), np.cumsum(1 + 2 * late))
+    np.testing.assert_allclose(law.covariance, both + 4.0)
+
+
 def test_sound_laws_are_what_the_twins_can_fit():
     for bench in (STREETS.bench, RUNS.bench):
         np.testing.assert_allclose(bench.family(bench.start), bench.law.covariance, rtol=1e-9)
