@@ -172,8 +172,8 @@ def _diffuse(rng: np.random.Generator, setting: Setting) -> Impairment:
     offset = rng.uniform(3, 15, (links, count, 1)) * _unit(rng.standard_normal((links, count, 3)))
     offset[..., 2] = np.abs(offset[..., 2])
     excess = np.exp(-np.linalg.norm(offset, axis=-1) / 10)
-    weight = circular(rng, (links, count)) * np.sqrt(excess / excess.sum(axis=1, keepdims=True))
-    return propagation.diffuse_scattering(offset, weight)
+    deviation = np.sqrt(excess / excess.sum(axis=1, keepdims=True))
+    return propagation.diffuse_scattering(offset, deviation, circular(rng, (links, count)))
 
 
 def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:

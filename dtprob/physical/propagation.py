@@ -126,36 +126,31 @@ def _scattered(world: World, rays: Rays, scatterer: Float[np.ndarray, "3"], size
 
 def diffuse_scattering(
     offset: Float[np.ndarray, "link scatterer 3"],
-    weight: Complex[np.ndarray, "link scatterer"],
+    deviation: Float[np.ndarray, "link scatterer"],
+    draw: Complex[np.ndarray, "link scatterer"],
     limit: float = 3.0,
 ) -> Impairment:
     """Many weak scatterers around every receiver; size is their amplitude over that of the traced paths.
 
     Args:
         offset: of the scatterers from the receiver, m.
-        weight: circular normal draws whose variances over scatterers add up to 1.
+        deviation: of their amplitudes; the squares over the scatterers of a link add up to 1.
+        draw: circular normal, of unit power.
         limit: of the size.
     """
 
-    def gains(rays: Rays, size: float) -> Complex[np.ndarray, "link scatterer"]:
+    def joined(world: World, rays: Rays, amplitude: Complex[np.ndarray, "link scatterer"]) -> Rays:
+        tx, rx = world.tx_position, world.rx_position
         level = np.sqrt(np.mean(np.sum(np.abs(rays.gain[:, 0]) ** 2, axis=-1)))
-        return size * level * weight
+        return join(rays, level * amplitude, rx[:, None] + offset, tx, rx)
 
     def scatter(world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        tx, rx = world.tx_position, world.rx_position
-        return join(rays, gains(rays, size), rx[:, None] + offset, tx, rx)
+        return joined(world, rays, size * deviation * draw)
 
     def spread(world: World, rays: Rays, sounding: Sounding, size: float) -> Columns:
-        tail = scatter(
-            world,
-            dataclasses.replace(rays, gain=rays.gain[:, :1], unfolded=rays.unfolded[:, :1]),
-            sounding,
-            size,
-        )
+        first = dataclasses.replace(rays, gain=rays.gain[:, :1], unfolded=rays.unfolded[:, :1])
+        tail = joined(world, first, (size / np.sqrt(2) * deviation).astype(complex))
         each = path_channels(world, tail, sounding)[:, 0, rays.mask.shape[1] :]
-        modulus = np.abs(weight)
-        expected = np.sqrt(np.mean(modulus**2, axis=0) / 2) / np.where(modulus > 0, modulus, 1.0)
-        each = each * expected[..., None, None, None]
         flat = np.tile(each.reshape(*each.shape[:2], -1), (1, 1, len(sounding.snapshot_time)))
         return np.concatenate([flat, 1j * flat], axis=1)
 

@@ -177,6 +177,22 @@ def test_oscillators_walk_or_stay(world):
     assert abs(np.mean(angle[:, 1:] * angle[:, :-1])) < 5e-4
 
 
+def test_what_diffuse_scatterers_may_add_does_not_depend_on_what_they_did(bench):
+    rng = np.random.default_rng(0)
+    offset, deviation = rng.uniform(3, 9, (6, 5, 3)), np.sqrt(np.arange(1, 6) / 15) * np.ones((6, 1))
+    columns, shifts = [], []
+    for _ in range(200):
+        draw = (rng.standard_normal((6, 5)) + 1j * rng.standard_normal((6, 5))) / np.sqrt(2)
+        made = propagation.diffuse_scattering(offset, deviation, draw)
+        assert made.spread is not None
+        columns.append(made.spread(bench.world, bench.base.rays, bench.sounding, 0.1))
+        shifts.append(bench.difference(made, 0.1))
+    np.testing.assert_array_equal(columns[0], columns[1])
+    power = np.sum(np.abs(columns[0]) ** 2, axis=(1, 2))
+    seen = np.sum(np.abs(np.reshape(shifts, (200, 6, -1))) ** 2, axis=2).mean(axis=0)
+    np.testing.assert_allclose(seen, power, rtol=0.25)
+
+
 @pytest.mark.parametrize("family", ["phase_noise", "carrier_phase_drift", "phase_error", "shadowing"])
 def test_what_random_components_add_is_the_variance_of_draws(family, bench, setting):
     size, total = 1e-3, np.zeros(bench.base.mean.size)
