@@ -7,10 +7,12 @@ import pytest
 
 from dtprob.errors import InputError
 from dtprob.physical import antennas, front_end, placement, propagation
+from dtprob.physical.bench import prepare
 from dtprob.physical.channel import Sounding, mean_power, subcarriers
 from dtprob.physical.draws import FAMILIES, draw
 from dtprob.physical.impairment import Tracer, measure
 from dtprob.physical.waveform import chirp, symmetric_pilot, to_time
+from tests.unit.physical.conftest import MATERIALS
 
 RELATIVE = 1e-11
 
@@ -204,6 +206,19 @@ def test_what_random_components_add_is_the_variance_of_draws(family, bench, sett
     columns = made.spread(bench.base.world, bench.base.rays, bench.sounding, size)
     power = np.sum(np.abs(columns) ** 2, axis=1).sum()
     assert total.sum() == pytest.approx(power, rel=0.15)
+
+
+@pytest.mark.parametrize("family", ["phase_noise", "carrier_phase_drift", "shadowing"])
+def test_packets_of_unknown_phase_hide_common_phases(family, bench, setting, trace):
+    angles = np.random.default_rng(0).uniform(-np.pi, np.pi, (6, 3))
+    always = ((front_end.packet_phase(angles), 1.0),)
+    other = prepare(
+        bench.world, bench.sounding, bench.noise, trace, MATERIALS, phase="per_packet", always=always
+    )
+    made = drawn(family, setting)
+    found, known = (one.information(made, 0.05) for one in (other, bench))
+    assert known > 10
+    assert found < 1e-6 if family != "shadowing" else 0.5 * known < found < 1.01 * known
 
 
 def test_dipoles_have_the_impedances_of_the_textbook():
