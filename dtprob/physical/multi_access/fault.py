@@ -44,8 +44,8 @@ class Fault:
         arrivals: (rows, past, size) -> rows.
         acks: (acks, past, size) -> acks.
         start: memory before the first slot, by size.
-        follow: (memory, chance that the acknowledged set had without the fault, whether none was acknowledged, size)
-            -> memory for the next slot.
+        follow: (memory, chance that the acknowledged set had with all other faults, whether none was acknowledged, size)
+            -> memory for the next slot. Faults with a memory act on `acks` after all others.
     """
 
     family: str

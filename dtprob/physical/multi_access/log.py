@@ -30,8 +30,9 @@ def record(
         seed: of all draws; the same ones whatever the faults.
         network: traffic without memory.
         slots: length of the episode.
-        faults: each with its size; they act in this order.
+        faults: each with its size; they act in this order, those with a memory last.
     """
+    faults = sorted(faults, key=lambda one: one[0].follow is not None)
     uniform = np.random.default_rng(list(seed)).random((slots, network.devices + len(network.clusters) + 2))
     sets, sound = subsets(network.devices), sound_acks(network)
     place = 2 ** np.arange(network.devices)[::-1]
@@ -43,17 +44,19 @@ def record(
         u = uniform[slot]
         action = (u[1 : 1 + network.devices] < u[0]).astype(int)
         senders = int((action * (buffer > 0)) @ place)
-        rows, acks = _laws(network, sound, faults, memories, slot=slot, slots=slots, arrival=arrival)
+        pasts = [Past(slot, slot / slots, arrival, memory) for memory in memories]
+        rows, acks = _laws(network, sound, list(zip(faults, pasts, strict=True)))
         divergence += _divergence(acks[senders], sound[senders])
         divergence += sum(map(_divergence, rows, network.arrival[:, 0]))
         acked = _inverse(acks[senders], u[1 + network.devices])
+        for number, (fault, size) in enumerate(faults):
+            if fault.follow is not None:
+                others = [each for k, each in enumerate(zip(faults, pasts, strict=True)) if k != number]
+                chance = float(_laws(network, sound, others)[1][senders, acked])
+                memories[number] = fault.follow(memories[number], chance, acked == 0, size)
         arrival = _joint(
             network, [_inverse(row, v) for row, v in zip(rows, u[2 + network.devices :], strict=True)]
         )
-        for number, (fault, size) in enumerate(faults):
-            if fault.follow is not None:
-                chance = float(sound[senders, acked])
-                memories[number] = fault.follow(memories[number], chance, acked == 0, size)
         ack = sets[acked]
         columns.append((buffer, action, ack, arrival))
         buffer = np.clip(buffer + arrival - ack, 0, network.capacity)
@@ -64,18 +67,11 @@ def record(
 
 
 def _laws(
-    network: Network,
-    sound: Acks,
-    faults: Sequence[tuple[Fault, float]],
-    memories: Sequence[float],
-    *,
-    slot: int,
-    slots: int,
-    arrival: np.ndarray,
+    network: Network, sound: Acks, faults: Sequence[tuple[tuple[Fault, float], Past]]
 ) -> tuple[Rows, Acks]:
+    """The laws of a slot with faults, each with its size and its past."""
     rows, acks = network.arrival[:, 0], sound
-    for (fault, size), memory in zip(faults, memories, strict=True):
-        past = Past(slot, slot / slots, arrival, memory)
+    for (fault, size), past in faults:
         rows = fault.arrivals(rows, past, size) if fault.arrivals else rows
         acks = fault.acks(acks, past, size) if fault.acks else acks
     return rows, acks

@@ -1,6 +1,7 @@
 """Faults of networks and the withheld cases made of them: laws, information, and the same bytes from the same seed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -76,6 +77,27 @@ def test_an_outage_is_remembered():
     assert silent > bad > heard
     share = np.mean(record((2,), NETWORK, 20_000, [(fault, 0.2)]).log.ack.sum(1) == 0)
     assert share > np.mean(record((2,), NETWORK, 20_000).log.ack.sum(1) == 0)
+
+
+@pytest.mark.parametrize("family", [None, "ack_loss", "capture", "near_far", "duty_cycle"])
+def test_an_outage_is_remembered_beside_other_faults(family):
+    """The memory is the chance of an outage given the past, so that on average it is what it started with."""
+    outage = draw(np.random.default_rng(0), "bursty_channel", NETWORK)
+    memories = []
+
+    def follow(bad, *seen):
+        memories.append(outage.follow(bad, *seen))
+        return memories[-1]
+
+    faults = [(replace(outage, follow=follow), 0.3)]
+    if family is not None:
+        faults.append((draw(np.random.default_rng(0), family, NETWORK), 0.45))
+    record((3,), NETWORK, 6000, faults)
+    # The memory is forgotten within some ten slots, so that its mean strays by 0.01.
+    assert np.mean(memories) == pytest.approx(0.3, abs=0.03)
+    assert record((3,), NETWORK, 300, faults[::-1]).divergence == pytest.approx(
+        record((3,), NETWORK, 300, faults).divergence
+    )
 
 
 def test_cases(tmp_path):
