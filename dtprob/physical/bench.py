@@ -61,7 +61,8 @@ class Bench:
     def information(self, impairment: Impairment, size: float) -> float:
         """Lambda of an impairment alone, against the base with its free parameters fitted."""
         if impairment.noise is not None:
-            return self.simulate((impairment, size)).noise.information(self.base.mean.shape)
+            found = self.simulate((impairment, size))
+            return found.noise.information(found.mean, self.sounding, self.tangents, self.precision)
         if impairment.spread is not None:
             columns = self._received(impairment.spread(self.base.world, self.base.rays, self.sounding, size))
             return spread_information(columns, self.tangents, self.noise_power, self.precision)

@@ -36,7 +36,7 @@ def error(found, expected):
 def test_nothing_at_size_zero(family, seed, bench, setting):
     found = bench.simulate((drawn(family, setting, seed), 0.0))
     assert error(found.mean, clean(bench)) < RELATIVE
-    assert found.noise.information(found.mean.shape) < 1e-6
+    assert found.noise.information(found.mean, bench.sounding, bench.tangents) < 1e-6
     assert found.noise.mean_power(found.mean.shape) == pytest.approx(bench.noise_power)
 
 
@@ -56,7 +56,7 @@ def test_a_size_changes_something(family, bench, setting):
     changed = error(found.mean, clean(bench)) > 1e-6
     assert changed != (made.noise is not None)
     if made.noise is not None:
-        assert found.noise.information(found.mean.shape) > 0
+        assert found.noise.information(found.mean, bench.sounding, bench.tangents) > 0
 
 
 @pytest.mark.parametrize("family", sorted(FAMILIES))
