@@ -170,7 +170,9 @@ def _with_fading(
 ) -> Law:
     """A law whose fading is so much deeper and faster than it was; what other faults added to the covariance is kept."""
     even = np.ones(STEPS)
-    before = law if isinstance(law, _Faded) else _Faded(law.mean, law.covariance, even, even)
+    before = (
+        law if isinstance(law, _Faded) else _Faded(law.mean, law.covariance, even, even, ceiling=law.ceiling)
+    )
     after = replace(before, depth=before.depth * depth, pace=before.pace * pace)
     old, new = (runs.faded(runs.fading * one.depth, np.cumsum(one.pace)) for one in (before, after))
     return replace(after, covariance=law.covariance - old + new)
