@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Complex, Float
 
 from dtprob.physical.channel import Sounding, path_channels
-from dtprob.physical.impairment import Impairment, Simulation, simulate
+from dtprob.physical.impairment import Columns, Impairment, Simulation, simulate
 from dtprob.physical.information import mean_information, projected, size_for, spread_information
 from dtprob.physical.noise import Noise
 from dtprob.physical.rays import Rays
@@ -61,13 +61,27 @@ class Bench:
     def information(self, impairment: Impairment, size: float) -> float:
         """Lambda of an impairment alone, against the base with its free parameters fitted."""
         if impairment.noise is not None:
-            return self.simulate((impairment, size)).noise.information(self.base.mean.shape)
+            found = self.simulate((impairment, size))
+            return found.noise.information(found.mean, self.sounding, self.tangents, self.precision)
         if impairment.spread is not None:
-            columns = impairment.spread(self.base.world, self.base.rays, self.sounding, size)
-            return spread_information(columns, self.noise_power, self.base.mean.size)
+            columns = self._received(impairment.spread(self.base.world, self.base.rays, self.sounding, size))
+            return spread_information(columns, self.tangents, self.noise_power, self.precision)
         return mean_information(
             self.difference(impairment, size), self.tangents, self.noise_power, self.precision
         )
+
+    def _received(self, columns: Columns) -> Columns:
+        """What columns add behind the impairments that the twin models, which are linear in the channel."""
+        behind = [(one.channel, size) for one, size in self.always if one.channel]
+        if not behind:
+            return columns
+        rows = []
+        for column in columns.swapaxes(0, 1).reshape(columns.shape[1], *self.base.mean.shape):
+            found = column
+            for change, size in behind:
+                found = change(self.world, found, self.sounding, size)
+            rows.append(found.reshape(len(columns), -1))
+        return np.stack(rows, axis=1)
 
     def size_for(self, impairment: Impairment, target: float) -> tuple[float, float]:
         """Size of an impairment whose lambda is `target`, and the lambda reached.

@@ -88,7 +88,7 @@ def _cells(bench: Bench, simulation: Simulation, lambda_: float) -> dict[str, li
     shift = (simulation.mean - bench.base.mean).reshape(-1)
     left = projected(shift, bench.tangents, bench.noise_power, bench.precision)
     energy = (left[: shift.size] ** 2 + left[shift.size :] ** 2).reshape(shape) / bench.noise_power
-    louder = np.broadcast_to(np.log(simulation.noise.power / np.min(simulation.noise.power)), shape)
+    louder = np.broadcast_to(np.log(simulation.noise.level / bench.noise.level), shape)
     return touched(energy + louder**2, AXES, lambda_, ("link",))
 
 

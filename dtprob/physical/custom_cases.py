@@ -31,8 +31,13 @@ _CODE: Final = Path(__file__).parent / "user_code"
 
 
 def _campaign(rng: np.random.Generator, number: int, families: Sequence[str]) -> Setup:
-    """Campaigns with streets and with runs take turns."""
-    return _runs(rng, families) if number % 2 else _streets(rng, families)
+    """Campaigns with streets and with runs take turns, where both have one of the families."""
+    kinds = [
+        make
+        for make, known in ((_streets, path_loss.FAMILIES), (_runs, fading.FAMILIES))
+        if set(known) & set(families)
+    ]
+    return kinds[number % len(kinds)](rng, families)
 
 
 def _streets(rng: np.random.Generator, families: Sequence[str]) -> Setup:

@@ -97,8 +97,7 @@ def _speed_change(_rng: np.random.Generator, runs: Runs) -> Fault:
     """The second half is driven faster, so that shadows pass sooner."""
 
     def change(law: Law, size: float) -> Law:
-        clock = np.cumsum(1 + size * _LATE)
-        return _with_fading(runs, law, runs.faded(np.full(STEPS, runs.fading), clock))
+        return _with_fading(runs, law, pace=1 + size * _LATE)
 
     return Fault("speed_change", None, "1", 12.0, change)
 
@@ -116,8 +115,7 @@ def _deeper_fading(_rng: np.random.Generator, runs: Runs) -> Fault:
     """Taller houses along the second half."""
 
     def change(law: Law, size: float) -> Law:
-        deviation = runs.fading * (1 + size * _LATE)
-        return _with_fading(runs, law, runs.faded(deviation, np.arange(STEPS, dtype=float)))
+        return _with_fading(runs, law, depth=1 + size * _LATE)
 
     return Fault("deeper_fading", None, "1", 5.0, change)
 
@@ -130,7 +128,7 @@ def _periodic_gain(rng: np.random.Generator, _runs: Runs) -> Fault:
 
 def _bursts(rng: np.random.Generator, _runs: Runs) -> Fault:
     """A stranger's bursts add power: two in each run, anywhere."""
-    start = rng.integers(0, STEPS - _BURST, (RUNS, 2, 1))
+    start = rng.integers(0, STEPS - _BURST + 1, (RUNS, 2, 1))
     steps = np.arange(STEPS)
     inside = ((steps >= start) & (steps < start + _BURST)).any(axis=1)
     return Fault("bursts", None, "dB", _LARGEST_DB, shifted(1.0 * inside))
@@ -150,9 +148,34 @@ def _all(shape: Float[np.ndarray, " step"]) -> Vector:
     return np.broadcast_to(shape, (RUNS, STEPS))
 
 
-def _with_fading(runs: Runs, law: Law, covariance: Covariance) -> Law:
-    """A law whose sound part of the covariance is replaced, what other faults did to it kept."""
-    return replace(law, covariance=law.covariance - runs.bench.law.covariance + covariance)
+@dataclass(frozen=True)
+class _Faded(Law):
+    """A law whose fading runs otherwise.
+
+    Attributes:
+        depth: of the fading at each step, over the sound one.
+        pace: of the clock by which it forgets, likewise.
+    """
+
+    depth: Float[np.ndarray, " step"]
+    pace: Float[np.ndarray, " step"]
+
+
+def _with_fading(
+    runs: Runs,
+    law: Law,
+    *,
+    depth: Float[np.ndarray, " step"] | float = 1.0,
+    pace: Float[np.ndarray, " step"] | float = 1.0,
+) -> Law:
+    """A law whose fading is so much deeper and faster than it was; what other faults added to the covariance is kept."""
+    even = np.ones(STEPS)
+    before = (
+        law if isinstance(law, _Faded) else _Faded(law.mean, law.covariance, even, even, ceiling=law.ceiling)
+    )
+    after = replace(before, depth=before.depth * depth, pace=before.pace * pace)
+    old, new = (runs.faded(runs.fading * one.depth, np.cumsum(one.pace)) for one in (before, after))
+    return replace(after, covariance=law.covariance - old + new)
 
 
 _DRAWS: Final[dict[str, Callable[[np.random.Generator, Runs], Fault]]] = {

@@ -133,6 +133,11 @@ def _phase_error(rng: np.random.Generator, setting: Setting) -> Impairment:
     return propagation.phase_error(rng.standard_normal((world.n_link, snapshots, setting.rays.mask.shape[1])))
 
 
+def _over_time(draw: Callable[[np.random.Generator, Setting], Impairment]) -> Draw:
+    """A draw of what shows from snapshot to snapshot; a campaign of a single one has no place for it."""
+    return lambda rng, setting: draw(rng, setting) if len(setting.sounding.snapshot_time) > 1 else None
+
+
 def _doppler(rng: np.random.Generator, setting: Setting) -> Impairment:
     limit = 0.4 * setting.world.wavelength / setting.interval
     return propagation.doppler(_direction(rng) * (1, 1, 0.1), limit)
@@ -167,8 +172,8 @@ def _diffuse(rng: np.random.Generator, setting: Setting) -> Impairment:
     offset = rng.uniform(3, 15, (links, count, 1)) * _unit(rng.standard_normal((links, count, 3)))
     offset[..., 2] = np.abs(offset[..., 2])
     excess = np.exp(-np.linalg.norm(offset, axis=-1) / 10)
-    weight = circular(rng, (links, count)) * np.sqrt(excess / excess.sum(axis=1, keepdims=True))
-    return propagation.diffuse_scattering(offset, weight)
+    deviation = np.sqrt(excess / excess.sum(axis=1, keepdims=True))
+    return propagation.diffuse_scattering(offset, deviation, circular(rng, (links, count)))
 
 
 def _unit(vectors: Float[np.ndarray, "*n 3"]) -> Float[np.ndarray, "*n 3"]:
@@ -228,11 +233,11 @@ FAMILIES: Final[dict[str, Draw]] = {
     "polarization_mismatch": lambda _rng, _: placement.polarization_mismatch(),
     "element_spacing": _with_array(placement.element_spacing()),
     "phase_error": _phase_error,
-    "doppler": _doppler,
+    "doppler": _over_time(_doppler),
     "missing_path": _missing,
     "blockage": _blockage,
     "extra_path": lambda rng, setting: propagation.extra_path(_spot(rng, setting)),
-    "pedestrian": _pedestrian,
+    "pedestrian": _over_time(_pedestrian),
     "dispersive_walls": lambda _rng, _: propagation.dispersive_walls(),
     "shadowing": lambda rng, setting: propagation.shadowing(rng.standard_normal(setting.world.n_link)),
     "diffuse_scattering": _diffuse,
@@ -244,10 +249,12 @@ FAMILIES: Final[dict[str, Draw]] = {
     "mutual_coupling": _with_array(antennas.mutual_coupling()),
     "cable_delay": _cable,
     "timing_offset": lambda _rng, setting: front_end.timing_offset(1 / setting.sounding.bandwidth),
-    "sampling_clock_offset": lambda _rng, setting: front_end.sampling_clock_offset(
-        1 / setting.sounding.bandwidth / setting.interval
+    "sampling_clock_offset": _over_time(
+        lambda _rng, s: front_end.sampling_clock_offset(1 / s.sounding.bandwidth / s.interval)
     ),
-    "carrier_frequency_offset": lambda _rng, s: front_end.carrier_frequency_offset(0.4 / s.interval),
+    "carrier_frequency_offset": _over_time(
+        lambda _rng, s: front_end.carrier_frequency_offset(0.4 / s.interval)
+    ),
     "carrier_phase": lambda _rng, _: front_end.carrier_phase(),
     "iq_imbalance": _iq,
     "amplifier_nonlinearity": lambda rng, _: front_end.amplifier_nonlinearity(float(rng.uniform(1.0, 1.5))),
@@ -259,7 +266,7 @@ FAMILIES: Final[dict[str, Draw]] = {
         float(rng.uniform(-np.pi, np.pi)), float(rng.uniform(0, 1e-9))
     ),
     "gain_offset": lambda _rng, _: front_end.gain_offset(),
-    "gain_drift": lambda _rng, setting: front_end.gain_drift(2 * setting.interval),
+    "gain_drift": _over_time(lambda _rng, setting: front_end.gain_drift(2 * setting.interval)),
     "phase_noise": lambda rng, setting: front_end.phase_noise(_walk(setting, rng), 1e5),
     "carrier_phase_drift": lambda rng, setting: front_end.carrier_phase_drift(_walk(setting, rng)),
     "quantization": lambda _rng, _: front_end.quantization(),

@@ -80,7 +80,7 @@ def _several(
     for attempt in range(1, _TRIES):
         if len(found) == count:
             return tuple(found)
-        fault = families.draw(rng, str(rng.choice(np.asarray(families.known))))
+        fault = _drawn(rng, families, families.known)
         other = _sized(bench, fault, target) if _apart(bench, fault, found) else None
         if other is not None:
             found.append(other)
@@ -93,10 +93,16 @@ def _one(
     rng: np.random.Generator, bench: Bench, target: float, families: Families, names: Sequence[str]
 ) -> Sized:
     for _ in range(_TRIES):
-        found = _sized(bench, families.draw(rng, str(rng.choice(np.asarray(names)))), target)
+        found = _sized(bench, _drawn(rng, families, names), target)
         if found is not None:
             return found
     raise InputError("withheld case", f"a fault of lambda {target:g}", "none", "Ask for less")
+
+
+def _drawn(rng: np.random.Generator, families: Families, names: Sequence[str]) -> Fault:
+    if not names:
+        raise InputError("withheld case", "families that its campaign has", "none", "Name more families")
+    return families.draw(rng, str(rng.choice(np.asarray(names))))
 
 
 def _sized(bench: Bench, fault: Fault, target: float) -> Sized | None:
@@ -127,7 +133,7 @@ def _alike(a: np.ndarray, b: np.ndarray) -> float:
 
 def _aliased(rng: np.random.Generator, bench: Bench, target: float, families: Families) -> Choice:
     """Of several faults the one that looks most like another one of them, be it of the same family."""
-    drawn = [families.draw(rng, str(rng.choice(np.asarray(families.known)))) for _ in range(_POOL)]
+    drawn = [_drawn(rng, families, families.known) for _ in range(_POOL)]
     pool = list({fault.name: fault for fault in drawn}.values())
     seen = [_seen(bench, fault) for fault in pool]
     pairs = [(_alike(seen[i], seen[j]), i, j) for i in range(len(pool)) for j in range(len(pool)) if i != j]

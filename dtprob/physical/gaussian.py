@@ -12,7 +12,7 @@ from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float
-from scipy import optimize
+from scipy import optimize, special
 
 from dtprob.physical.information import size_for
 
@@ -26,19 +26,23 @@ _WIDEST: Final = 6.0
 """How far the logarithms of the covariance's parameters may move."""
 _STEP: Final = 1e-4
 """Of these logarithms, for derivatives."""
+_LEAST: Final = 1e-6
+"""Share of the variance of a measurement that is left at least."""
 
 
 @dataclass(frozen=True)
 class Law:
-    """The law of all measurements, normal in each block.
+    """The law of all measurements, normal in each block but for a receiver that saturates.
 
     Attributes:
-        mean: of each row.
-        covariance: of each block.
+        mean: of each row, before the receiver.
+        covariance: of each block, likewise.
+        ceiling: the largest level that the receiver shows.
     """
 
     mean: Vector
     covariance: Covariance
+    ceiling: float = field(default=np.inf, kw_only=True)
 
 
 @dataclass(frozen=True)
@@ -121,13 +125,38 @@ def louder(shape: Vector) -> Callable[[Law, float], Law]:
     return change
 
 
+def shown(law: Law) -> Law:
+    """The normal law with the moments of what the receiver shows.
+
+    Mean and variance of what is cut off at a level are exact, covariances to first order in the correlation.
+
+    Args:
+        law: of the measurements.
+    """
+    if np.isinf(law.ceiling):
+        return law
+    deviation = np.sqrt(np.einsum("bii->bi", law.covariance))
+    room = (law.ceiling - law.mean) / deviation
+    below, density = special.ndtr(room), np.exp(-(room**2) / 2) / np.sqrt(2 * np.pi)
+    missing = room * below + density
+    square = (room**2 + 1) * below + room * density
+    variance = deviation**2 * (square - missing**2)
+    covariance = below[:, :, None] * law.covariance * below[:, None, :]
+    index = np.arange(covariance.shape[1])
+    covariance[:, index, index] = np.maximum(variance, _LEAST * deviation**2)
+    return Law(law.ceiling - deviation * missing, covariance)
+
+
 def information(bench: Bench, law: Law) -> float:
     """Twice the divergence of a law from the nearest one that the twin can fit.
+
+    Of a saturated receiver only the mean and the covariance count, see `shown`.
 
     Args:
         bench: the sound law and the twin's freedom.
         law: the one with a fault.
     """
+    law = shown(law)
     entropy = _log_determinant(law.covariance)
     difference = law.mean - bench.law.mean
 
@@ -162,6 +191,7 @@ def visible(bench: Bench, law: Law) -> Float[np.ndarray, " direction"]:
 
     The change of the mean, then that of the covariance; the square of its length is lambda where that is small.
     """
+    law = shown(law)
     inverse = np.linalg.inv(bench.law.covariance)
     root = np.linalg.cholesky(inverse)
     left = _remaining(law.mean - bench.law.mean, bench.tangents, inverse)
@@ -197,7 +227,8 @@ def sized(bench: Bench, fault: Fault, target: float) -> Sized | None:
 def measure(rng: np.random.Generator, law: Law) -> Vector:
     """One draw of all measurements."""
     root = np.linalg.cholesky(law.covariance)
-    return law.mean + np.einsum("bij,bj->bi", root, rng.standard_normal(law.mean.shape))
+    drawn = law.mean + np.einsum("bij,bj->bi", root, rng.standard_normal(law.mean.shape))
+    return np.minimum(drawn, law.ceiling)
 
 
 def _remaining(difference: Vector, tangents: Tangents, inverse: Covariance) -> Vector:

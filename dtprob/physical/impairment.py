@@ -37,7 +37,9 @@ class Impairment:
         limit: largest size that makes sense.
         instance: which object or antenna; None where there is only one.
         world: changes the world before it is traced.
-        rays: changes the traced paths.
+        joins: joins paths to the traced ones, where the antennas stand at time zero.
+        motion: moves the receivers while they measure.
+        rays: changes the gains of all paths.
         synthesis: replaces the sum over paths.
         channel: changes the noiseless channel as antennas, radio-frequency parts and sampling do.
         noise: changes the law of the noise.
@@ -50,6 +52,8 @@ class Impairment:
     limit: float
     instance: str | None = None
     world: OnWorld | None = None
+    joins: OnRays | None = None
+    motion: OnRays | None = None
     rays: OnRays | None = None
     synthesis: Synthesis | None = None
     channel: OnChannel | None = None
@@ -117,6 +121,10 @@ def simulate(
     for one, size in impairments:
         world = one.world(world, size) if one.world else world
     rays = tracer(world)
+    for one, size in impairments:
+        rays = one.joins(world, rays, sounding, size) if one.joins else rays
+    for one, size in impairments:
+        rays = one.motion(world, rays, sounding, size) if one.motion else rays
     for one, size in impairments:
         rays = one.rays(world, rays, sounding, size) if one.rays else rays
     mean = _sum(world, rays, sounding, impairments)

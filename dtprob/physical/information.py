@@ -49,6 +49,16 @@ def projected(
     d = _stack(difference)
     if not len(tangents):
         return d
+    basis, gram = _basis(tangents, noise_power, precision)
+    return d - np.linalg.solve(gram, basis @ d) @ basis
+
+
+def _basis(
+    tangents: Complex[np.ndarray, "nuisance entry"],
+    noise_power: float,
+    precision: Float[np.ndarray, " nuisance"] | None,
+) -> tuple[Float[np.ndarray, "nuisance twice"], Float[np.ndarray, "nuisance nuisance"]]:
+    """The tangents of unit length, and the matrix of the normal equations of a fit by them."""
     basis = _stack(tangents)
     scale = np.linalg.norm(basis, axis=1)
     scale = np.where(scale > 0, scale, 1.0)
@@ -56,24 +66,44 @@ def projected(
     gram = basis @ basis.T
     prior = np.zeros(len(scale)) if precision is None else precision * noise_power / 2 / scale**2
     gram[np.diag_indices_from(gram)] += prior + 1e-12
-    return d - np.linalg.solve(gram, basis @ d) @ basis
+    return basis, gram
 
 
 def spread_information(
-    columns: Complex[np.ndarray, "block component entry"], noise_power: float, count: int
+    columns: Complex[np.ndarray, "block component entry"],
+    tangents: Complex[np.ndarray, "nuisance whole"],
+    noise_power: float,
+    precision: Float[np.ndarray, " nuisance"] | None = None,
 ) -> float:
     """Lambda of a random change of the mean: sum of columns, each times an independent real standard normal.
 
+    With U the columns over the standard deviation of the noise and I - P what is left beside the base model's free
+    parameters, it follows from the trace and the determinant of I + U^T (I - P) U. Neither needs a matrix that is
+    larger than the number of components of a block, or of parameters.
+
     Args:
-        columns: per independent block of the data, what one unit of each random component adds.
+        columns: per independent block of the data, what one unit of each random component adds; the blocks one after the
+            other are all the data.
+        tangents: derivative of the mean by each free parameter of the base model.
         noise_power: E |noise|^2 per entry.
-        count: number of complex entries of all the data.
+        precision: prior precision of each free parameter; none when None.
     """
-    stacked = _stack(columns)
-    gram = np.einsum("bie,bje->bij", stacked, stacked)
-    extra = np.clip(np.linalg.eigvalsh(gram), 0, None).reshape(-1) / (noise_power / 2)
-    mean = 1 + extra.sum() / (2 * count)
-    return float(2 * count * np.log(mean) - np.sum(np.log1p(extra)))
+    blocks, components, entries = columns.shape
+    stacked = _stack(columns) / np.sqrt(noise_power / 2)
+    alone = stacked @ np.swapaxes(stacked, 1, 2)
+    trace = float(np.trace(alone, axis1=1, axis2=2).sum())
+    alone += np.eye(components)
+    determinant = float(np.linalg.slogdet(alone)[1].sum())
+    if len(tangents):
+        basis, gram = _basis(tangents, noise_power, precision)
+        parts = _stack(_complex(basis).reshape(len(basis), blocks, entries)).swapaxes(0, 1)
+        shared = stacked @ np.swapaxes(parts, 1, 2)
+        hidden = np.einsum("bcn,bcm->nm", shared, shared)
+        left = gram - np.einsum("bcn,bcm->nm", shared, np.linalg.solve(alone, shared))
+        trace -= float(np.trace(np.linalg.solve(gram, hidden)))
+        determinant += float(np.linalg.slogdet(left)[1] - np.linalg.slogdet(gram)[1])
+    count = 2 * blocks * entries
+    return max(0.0, float(count * np.log1p(max(0.0, trace) / count) - determinant))
 
 
 def power_information(power: Float[np.ndarray, "..."]) -> float:
@@ -174,6 +204,11 @@ def _inside(guess: float, low: float, high: float, limit: float) -> float:
         return min(guess, limit)
     margin = 0.02 * (high - low)
     return guess if low + margin < guess < high - margin else (low + high) / 2
+
+
+def _complex(stacked: Float[np.ndarray, "*rows twice"]) -> Complex[np.ndarray, "*rows entry"]:
+    real, imaginary = np.split(stacked, 2, axis=-1)
+    return real + 1j * imaginary
 
 
 def _stack(values: Complex[np.ndarray, "*rows entry"]) -> Float[np.ndarray, "*rows twice"]:

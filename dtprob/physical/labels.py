@@ -43,8 +43,9 @@ class Setting(NamedTuple):
 
     Attributes:
         quality: "perfect" (the label is a function of the features, and predicted), "good" (least squares on
-            the other folds), "useless" (a function of features that do not matter), "overfitted" (least
-            squares on labels that have nothing to do with the features), "anti-correlated" (good, negated).
+            the other folds), "useless" (a direction of the features that is uncorrelated with the label),
+            "overfitted" (least squares on labels that have nothing to do with the features), "anti-correlated"
+            (good, negated).
         n: labelled samples.
         unlabelled: unlabelled samples, more than there are features.
         folds: number of folds.

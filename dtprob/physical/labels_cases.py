@@ -24,7 +24,7 @@ from dtprob.physical.study import Track, case_end
 
 CONVENTION: Final = (
     "lambda is twice the divergence of the labels' law from the nearest law of the twin, whose standard deviation is"
-    " fitted; exact for every size"
+    " fitted; exact for every size, but of a saturated receiver only the mean and the covariance of what it shows count"
 )
 _MODEL: Final = """[model]
 name = "label_twin"

@@ -20,6 +20,8 @@ _EDGE: Final = 0.01
 """Width of a zone's edge, as a share of the feature's range."""
 _DISTRICTS: Final = 24
 _LARGEST_DB: Final = 25.0
+_UNREACHED: Final = 5.0
+"""Standard deviations by which no label lies above the map."""
 
 
 def _zone(rng: np.random.Generator, survey: Survey) -> tuple[str, Rows]:
@@ -77,14 +79,17 @@ def _stale_map(rng: np.random.Generator, survey: Survey) -> Fault:
 
 
 def _saturation(_rng: np.random.Generator, survey: Survey) -> Fault:
-    """A receiver near a site cannot show more than its largest level; size is how far that lies below the strongest."""
-    strongest = survey.prediction.max() + 8.0
+    """A receiver near a site cannot show more than its largest level.
+
+    Size is how far that lies below a level that no label reaches, some deviations above the strongest prediction.
+    """
+    above = _UNREACHED * survey.deviation
+    strongest = float(survey.prediction.max()) + above
 
     def change(law: Law, size: float) -> Law:
-        over = law.mean - (strongest - size)
-        return replace(law, mean=law.mean - np.logaddexp(0.0, over))
+        return replace(law, ceiling=min(law.ceiling, strongest - size))
 
-    return Fault("saturation", None, "dB", 40.0, change)
+    return Fault("saturation", None, "dB", above + 32.0, change)
 
 
 def _swapped_segments(rng: np.random.Generator, survey: Survey) -> Fault:

@@ -13,13 +13,10 @@ from dtprob.physical.impairment import Columns, Impairment
 from dtprob.physical.rays import Rays
 from dtprob.physical.world import (
     Material,
-    Part,
     World,
-    add_object,
     displace_receivers,
     displace_transmitters,
     move_object,
-    remove_object,
     swap_material,
     turn_object,
 )
@@ -137,29 +134,6 @@ def thickness_mismatch(name: str, nominal: Material, limit: float = 0.1) -> Impa
         )
 
     return Impairment("thickness_mismatch", "m", limit, instance=name, world=thicken)
-
-
-def object_removal(name: str) -> Impairment:
-    """An object of the scene is not there; size 0 or 1."""
-    return Impairment(
-        "object_removal",
-        "1",
-        1.0,
-        instance=name,
-        world=lambda world, size: remove_object(world, name) if size else world,
-    )
-
-
-def object_addition(name: str, part: Part) -> Impairment:
-    """An object is there that the scene does not have; size 0 or 1."""
-    return Impairment(
-        "object_addition",
-        "1",
-        1.0,
-        instance=name,
-        world=lambda world, size: add_object(world, name, part) if size else world,
-        detail={"mesh": part.mesh.rsplit("/", 1)[-1], "position": list(part.position)},
-    )
 
 
 def antenna_orientation(axis: Sequence[float], limit: float = 0.5) -> Impairment:

@@ -11,7 +11,7 @@ from scipy.special import fresnel
 from dtprob.physical.channel import Sounding, path_channels, synthesise, synthesise_wide
 from dtprob.physical.impairment import Channel, Columns, Impairment
 from dtprob.physical.rays import Rays, join
-from dtprob.physical.world import World
+from dtprob.physical.world import World, rotation
 
 
 def phase_error(draw: Float[np.ndarray, "link instant path"], limit: float = 1.0) -> Impairment:
@@ -46,7 +46,7 @@ def doppler(velocity: Float[np.ndarray, "3"], limit: float = 100.0) -> Impairmen
     def drive(_world: World, rays: Rays, sounding: Sounding, size: float) -> Rays:
         return rays.shifted(size * velocity * sounding.snapshot_time[None, :, None])
 
-    return Impairment("doppler", "m/s", limit, rays=drive, detail={"direction": velocity.tolist()})
+    return Impairment("doppler", "m/s", limit, motion=drive, detail={"direction": velocity.tolist()})
 
 
 def blockage(azimuth: float, distance: float, limit: float = 10.0) -> Impairment:
@@ -105,54 +105,56 @@ def extra_path(scatterer: Float[np.ndarray, "3"], limit: float = 100.0) -> Impai
     Size is the root of its cross-section in m. Radar equation for amplitudes,
     a = lambda sqrt(rcs) / ((4 pi)^(3/2) d1 d2).
     """
+    return Impairment(
+        "extra_path",
+        "m",
+        limit,
+        joins=lambda world, rays, _sounding, size: _scattered(world, rays, scatterer, size),
+        detail={"position": scatterer.tolist()},
+    )
 
-    def scatter(world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        tx, rx = world.tx_position, world.rx_position
-        out = np.linalg.norm(scatterer - tx, axis=-1)
-        back = np.linalg.norm(rx - scatterer, axis=-1)
-        gain = size * world.wavelength / ((4 * np.pi) ** 1.5 * out * back)
-        via = np.broadcast_to(scatterer, (world.n_link, 1, 3))
-        return join(rays, gain[:, None].astype(complex), via, tx, rx)
 
-    return Impairment("extra_path", "m", limit, rays=scatter, detail={"position": scatterer.tolist()})
+def _scattered(world: World, rays: Rays, scatterer: Float[np.ndarray, "3"], size: float) -> Rays:
+    """The rays with a path of each link over a scatterer."""
+    tx, rx = world.tx_position, world.rx_position
+    out = np.linalg.norm(scatterer - tx, axis=-1)
+    back = np.linalg.norm(rx - scatterer, axis=-1)
+    gain = size * world.wavelength / ((4 * np.pi) ** 1.5 * out * back)
+    via = np.broadcast_to(scatterer, (world.n_link, 1, 3))
+    return join(rays, gain[:, None].astype(complex), via, tx, rx)
 
 
 def diffuse_scattering(
     offset: Float[np.ndarray, "link scatterer 3"],
-    weight: Complex[np.ndarray, "link scatterer"],
+    deviation: Float[np.ndarray, "link scatterer"],
+    draw: Complex[np.ndarray, "link scatterer"],
     limit: float = 3.0,
 ) -> Impairment:
     """Many weak scatterers around every receiver; size is their amplitude over that of the traced paths.
 
     Args:
         offset: of the scatterers from the receiver, m.
-        weight: circular normal draws whose variances over scatterers add up to 1.
+        deviation: of their amplitudes; the squares over the scatterers of a link add up to 1.
+        draw: circular normal, of unit power.
         limit: of the size.
     """
 
-    def gains(rays: Rays, size: float) -> Complex[np.ndarray, "link scatterer"]:
+    def joined(world: World, rays: Rays, amplitude: Complex[np.ndarray, "link scatterer"]) -> Rays:
+        tx, rx = world.tx_position, world.rx_position
         level = np.sqrt(np.mean(np.sum(np.abs(rays.gain[:, 0]) ** 2, axis=-1)))
-        return size * level * weight
+        return join(rays, level * amplitude, rx[:, None] + offset, tx, rx)
 
     def scatter(world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        tx, rx = world.tx_position, world.rx_position
-        return join(rays, gains(rays, size), rx[:, None] + offset, tx, rx)
+        return joined(world, rays, size * deviation * draw)
 
     def spread(world: World, rays: Rays, sounding: Sounding, size: float) -> Columns:
-        tail = scatter(
-            world,
-            dataclasses.replace(rays, gain=rays.gain[:, :1], unfolded=rays.unfolded[:, :1]),
-            sounding,
-            size,
-        )
+        first = dataclasses.replace(rays, gain=rays.gain[:, :1], unfolded=rays.unfolded[:, :1])
+        tail = joined(world, first, (size / np.sqrt(2) * deviation).astype(complex))
         each = path_channels(world, tail, sounding)[:, 0, rays.mask.shape[1] :]
-        modulus = np.abs(weight)
-        expected = np.sqrt(np.mean(modulus**2, axis=0) / 2) / np.where(modulus > 0, modulus, 1.0)
-        each = each * expected[..., None, None, None]
         flat = np.tile(each.reshape(*each.shape[:2], -1), (1, 1, len(sounding.snapshot_time)))
         return np.concatenate([flat, 1j * flat], axis=1)
 
-    return Impairment("diffuse_scattering", "1", limit, "near_receiver", rays=scatter, spread=spread)
+    return Impairment("diffuse_scattering", "1", limit, "near_receiver", joins=scatter, spread=spread)
 
 
 def atmospheric_attenuation(limit: float = 0.5) -> Impairment:
@@ -165,10 +167,12 @@ def atmospheric_attenuation(limit: float = 0.5) -> Impairment:
 
 
 def antenna_pattern(limit: float = 8.0) -> Impairment:
-    """The receiving elements are not isotropic: their field is sin(polar angle) to the power size."""
+    """The receiving elements are not isotropic: their field is sin(angle to their axis) to the power size."""
 
-    def weigh(_world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
-        sine = np.sqrt(np.clip(1 - rays.arrival[..., 2] ** 2, 1e-12, None))
+    def weigh(world: World, rays: Rays, _sounding: Sounding, size: float) -> Rays:
+        yaw, pitch, roll = world.rx_turn
+        axis = rotation((yaw, pitch, roll + world.rx_slant))[:, 2]
+        sine = np.sqrt(np.clip(1 - (rays.arrival @ axis) ** 2, 1e-12, None))
         return rays.scaled((sine**size)[:, None])
 
     return Impairment("antenna_pattern", "1", limit, rays=weigh)
@@ -202,17 +206,16 @@ def pedestrian(
         limit: of the size.
     """
 
-    def walk(world: World, rays: Rays, sounding: Sounding, size: float) -> Channel:
-        total = synthesise(world, rays, sounding)
-        for index, time in enumerate(sounding.snapshot_time):
-            there = extra_path(start + velocity * time).rays
-            moved = there(world, rays, sounding, size) if there else rays
-            each = path_channels(world, moved, sounding)[:, 0, rays.mask.shape[1] :]
-            total[:, index] += each.sum(axis=1)
-        return total
+    def walk(world: World, rays: Rays, sounding: Sounding, size: float) -> Rays:
+        each = [_scattered(world, rays, start + velocity * time, size) for time in sounding.snapshot_time]
+        gain, unfolded = (
+            np.stack([part[:, min(index, part.shape[1] - 1)] for index, part in enumerate(parts)], axis=1)
+            for parts in ([one.gain for one in each], [one.unfolded for one in each])
+        )
+        return dataclasses.replace(each[0], gain=gain, unfolded=unfolded)
 
     detail = {"position": start.tolist(), "velocity": velocity.tolist()}
-    return Impairment("pedestrian", "m", limit, synthesis=walk, detail=detail)
+    return Impairment("pedestrian", "m", limit, joins=walk, detail=detail)
 
 
 def dispersive_walls(limit: float = 2.0) -> Impairment:

@@ -3,7 +3,9 @@
 A chain of mirrors maps a point x near the receiver to R x + t, from where the transmitter sees it along a
 straight line. With u the vector from the transmitter to the unfolded receiver, the path has length |u|,
 leaves along u / |u| and arrives along R^T u / |u|; moving the receiver by d turns u into u + R d, exactly,
-however large d is. Everything that moves is computed that way, with no derivative and no small-angle step.
+however large d is. Everything that moves is computed that way, with no derivative and no small-angle step. A path
+through a point scatterer (`join`) is no chain of mirrors: its R only turns directions, and u + R d is right to first
+order in d over the distance to the scatterer.
 """
 
 from __future__ import annotations
@@ -62,17 +64,15 @@ class Rays:
         """Which paths meet the object of this name."""
         return self.meets[..., self.objects.index(name)] & self.mask
 
-    @property
-    def direct(self) -> Bool[np.ndarray, "link path"]:
-        """Which path is the line of sight."""
-        return ~self.meets.any(axis=-1) & self.mask
-
     def scaled(self, factor: Complex[np.ndarray, "#link #snapshot #path"]) -> Rays:
         """The rays with their gains multiplied."""
         return dataclasses.replace(self, gain=self.gain * factor)
 
     def shifted(self, displacement: Float[np.ndarray, "#link #snapshot 3"]) -> Rays:
-        """The rays after the receivers moved, in m; gains stay, the mirrors are taken as infinite planes."""
+        """The rays after the receivers moved, in m; gains stay, the mirrors are taken as infinite planes.
+
+        Paths of `join` are those of mirrors, which is right while the way is short beside that to the scatterer.
+        """
         step = np.einsum(
             "lpij,lsj->lspi", self.mirror, np.broadcast_to(displacement, self._moved_shape(displacement))
         )

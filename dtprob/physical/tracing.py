@@ -132,7 +132,9 @@ def _paint(world: World, scene: Any) -> None:
     for name, material in sorted(world.materials.items()):
         _assign(scene.radio_materials[name], material)
     for name, material in sorted(world.object_materials.items()):
-        one = scene.objects[name]
+        one = scene.objects.get(name)
+        if one is None:  # it was taken out
+            continue
         thickness = _read_material(one.radio_material).thickness
         full = Material(material.permittivity, material.conductivity, material.thickness or thickness)
         one.radio_material = _material(f"of {name}", full)
@@ -173,11 +175,11 @@ def _shape(name: str, one: Any, world: World) -> _Shape:
 def _place(world: World, scene: Any) -> None:
     import mitsuba as mi  # noqa: PLC0415
 
-    for name, angle in sorted(world.turned.items()):
-        scene.objects[name].orientation = mi.Point3f(float(angle), 0.0, 0.0)
-    for name, vector in sorted(world.moved.items()):
-        one = scene.objects[name]
-        one.position = one.position + mi.Point3f(*map(float, vector))
+    for name, one in sorted(scene.objects.items()):
+        if name in world.turned:
+            one.orientation = mi.Point3f(float(world.turned[name]), 0.0, 0.0)
+        if name in world.moved:
+            one.position = one.position + mi.Point3f(*map(float, world.moved[name]))
 
 
 def _links(scene: Any, world: World) -> _Found:

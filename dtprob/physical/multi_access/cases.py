@@ -19,6 +19,7 @@ from dtprob.errors import InputError
 from dtprob.files import write_text
 from dtprob.physical.cells import touched
 from dtprob.physical.information import size_for
+from dtprob.physical.multi_access.divergence import information
 from dtprob.physical.multi_access.fault import Fault, Past
 from dtprob.physical.multi_access.faults import FAMILIES, FOREIGN, LISTED, draw
 from dtprob.physical.multi_access.likeness import likeness
@@ -29,8 +30,8 @@ from dtprob.physical.study import Order, Track, case_end
 KINDS: Final = ("null", "listed", "unlisted", "pair", "triple", "alias")
 BEFORE, AFTER, WINDOW = 3000, 600, 10
 CONVENTION: Final = (
-    "lambda is twice the divergence of the log's law from the sound network's, summed over slots, times"
-    " before / (before + after) for what the twin absorbs when it is fitted to both logs"
+    "lambda is twice the divergence of the law of both logs from that of one network whose tables are fitted to both;"
+    " exact for every size"
 )
 _MODEL: Final = f"""[model]
 name = "multi_access"
@@ -79,9 +80,9 @@ def _case(out: Path, order: Order, network: Network) -> dict[str, Any]:
     faults, excluded, alias = _choose(order.rng, order.kind, network, order.lambda_, order.families)
     folder, draws = out / "cases" / order.name, (order.seed, order.index)
     folder.mkdir(parents=True, exist_ok=True)
-    write(folder / "before.csv", record((*draws, 2), network, BEFORE).log)
+    write(folder / "before.csv", record((*draws, 2), network, BEFORE))
     after = record((*draws, 3), network, AFTER, [(one.fault, one.size) for one in faults])
-    write(folder / "after.csv", after.log)
+    write(folder / "after.csv", after)
     write_text(folder / "case.toml", _MODEL + case_end(excluded, order.index))
     about = {"arrival": network.arrival.tolist(), "reception": network.reception.tolist()}
     effects = [one.record() for one in faults]
@@ -96,9 +97,10 @@ def _cells(network: Network, faults: Sequence[_Active]) -> dict[str, list[int]]:
     sound = network.arrival[:, 0]
     before = np.ones(network.devices, int)
     change = sum(
-        abs(one.fault.arrivals(sound, Past(AFTER, 1.0, before, one.fault.start(one.size)), one.size) - sound)
+        abs(one.fault.arrivals(sound, Past(slot, slot / AFTER, before), one.size) - sound)
         for one in faults
         if one.fault.arrivals is not None
+        for slot in range(AFTER)
     )
     return touched(np.asarray(change).sum(axis=1), ("cluster",), sum(one.lambda_ for one in faults))
 
@@ -159,20 +161,16 @@ def _aliased(rng: np.random.Generator, network: Network, target: float, families
 
 def _sized(rng: np.random.Generator, network: Network, target: float, families: Sequence[str]) -> _Active:
     """One fault of the right information."""
-    seed = [int(rng.integers(2**31))]
     for _ in range(_TRIES):
         fault = draw(rng, str(rng.choice(np.asarray(families))), network)
         try:
-            size, found = size_for(target, partial(_information, seed, network, fault), limit=fault.limit)
+            told = partial(information, network, fault, before=BEFORE, after=AFTER)
+            size, found = size_for(target, told, limit=fault.limit)
         except InputError:
             continue
         if abs(found / target - 1) <= _TOLERANCE:
             return _Active(fault, size, found)
     raise InputError("withheld case", f"a fault of lambda {target:g}", "none", "Ask for less")
-
-
-def _information(seed: Sequence[int], network: Network, fault: Fault, size: float) -> float:
-    return 2 * record(seed, network, AFTER, [(fault, size)]).divergence * BEFORE / (BEFORE + AFTER)
 
 
 TRACK: Final = Track(

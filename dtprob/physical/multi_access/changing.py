@@ -51,7 +51,7 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
         }
         self.action_spaces: dict[str, Any] = {agent: Discrete(2) for agent in self.possible_agents}
         self._stages, self._horizon = list(stages), horizon
-        self._random, self._total = np.random.default_rng(0), 0
+        self._random, self._total, self._begun = np.random.default_rng(0), 0, False
         self._seen = np.zeros((first.devices, 4), np.int64)
 
     def observation_space(self, agent: str) -> gymnasium.Space[np.ndarray]:
@@ -77,7 +77,7 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
             for agent in self.possible_agents:
                 self.action_spaces[agent].seed(seed)
         self.agents = list(self.possible_agents)
-        self._seen = np.zeros_like(self._seen)
+        self._seen, self._begun = np.zeros_like(self._seen), True
         return self._shown(self.agents), {agent: {} for agent in self.agents}
 
     def step(
@@ -86,14 +86,16 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
         """One slot.
 
         Args:
-            actions: of every device.
+            actions: of every device; an episode that has ended takes none.
 
         Raises:
             InputError: no episode is under way, or a device has no action.
         """
         agents = self.agents
-        if not agents and actions:
+        if not self._begun or (not agents and actions):
             raise InputError("step", "an episode under way", "none", "Call reset first")
+        if not agents:
+            return {}, {}, {}, {}, {}
         missing = [agent for agent in agents if agent not in actions]
         if missing:
             remedy = "Give an action for every device"

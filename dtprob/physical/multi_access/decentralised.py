@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from dtprob.errors import DtprobError
 from dtprob.physical.multi_access.chain import Chain
 from dtprob.physical.multi_access.exact import (
     Averages,
@@ -36,21 +37,37 @@ def improve(chain: Chain, rule: Rule) -> Found:
     """Ascend to a rule whose throughput no single decision improves.
 
     The throughput is monotone in each single chance while the others are kept, so that the best value of a
-    chance is 0 or 1, and its slope says which. The steepest wrong chance is set right until none is left.
+    chance is 0 or 1, and its slope says which. The steepest wrong chance is set right until none is left. Then
+    one of the chances between 0 and 1 is set, which alone does not matter but may give the others slopes.
 
     Args:
         chain: that knows the last acknowledgements.
         rule: where to start.
     """
     rule = np.array(check_rule(chain, rule), float)
+    rule[:, :, 0] = np.round(rule[:, :, 0])  # an empty buffer sends nothing
+    slope = slopes(chain, rule)
     while True:
-        slope = slopes(chain, rule)
         gain = np.where(slope > 0, 1 - rule, rule) * np.abs(slope)
         worst = np.unravel_index(np.argmax(gain), gain.shape)
-        if gain[worst] < _LEAST_GAIN:
-            rule = np.round(rule)  # chances between 0 and 1 that are left do not matter
+        if gain[worst] >= _LEAST_GAIN:
+            rule[worst] = float(slope[worst] > 0)
+            slope = slopes(chain, rule)
+            continue
+        undecided = np.argwhere((rule > 0) & (rule < 1))
+        if not len(undecided):
             return Found(rule, average(chain, rule))
-        rule[worst] = float(slope[worst] > 0)
+        slope = _decide(chain, rule, tuple(undecided[0]), slope)
+
+
+def _decide(chain: Chain, rule: Rule, place: tuple[int, ...], slope: Rule) -> Rule:
+    """Set a chance that alone does not matter to 0 or 1, so that there still is one long run; gives the new slopes."""
+    rule[place] = float(slope[place] > 0)
+    try:
+        return slopes(chain, rule)
+    except DtprobError:  # from some starts the network would come to a standstill
+        rule[place] = 1 - rule[place]
+        return slopes(chain, rule)
 
 
 def slopes(chain: Chain, rule: Rule) -> Rule:

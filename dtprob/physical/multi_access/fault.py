@@ -35,22 +35,24 @@ class Past:
 
 @dataclass(frozen=True)
 class Fault:
-    """One fault; its size is a probability or share, 0 is none.
+    """One fault, of the traffic or of the reception; its size is a probability or share, 0 is none.
 
     Attributes:
         family: name of the physics.
         instance: which device, pair or number of senders; None where there is only one.
         limit: largest size.
+        period: slots after which its laws repeat; None where they change all along the log.
         arrivals: (rows, past, size) -> rows.
         acks: (acks, past, size) -> acks.
         start: memory before the first slot, by size.
-        follow: (memory, chance that the acknowledged set had without the fault, whether none was acknowledged, size)
-            -> memory for the next slot.
+        follow: (memory, chance that the acknowledged set had with all other faults, whether none was acknowledged, size)
+            -> memory for the next slot. Faults with a memory act on `acks` after all others.
     """
 
     family: str
     instance: str | None
     limit: float = 0.95
+    period: int | None = 1
     arrivals: Callable[[Rows, Past, float], Rows] | None = None
     acks: Callable[[Acks, Past, float], Acks] | None = None
     start: Callable[[float], float] = lambda _: 0.0

@@ -1,10 +1,9 @@
-"""Logs of a network, with faults or without, and how much the faults can be told by."""
+"""Logs of a network, with faults or without."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from math import comb
-from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -14,68 +13,53 @@ from dtprob.physical.multi_access.fault import Acks, Fault, Past, Rows, subsets
 from dtprob.physical.multi_access.network import Network
 
 
-class Recording(NamedTuple):
-    """A log, and the sum over its slots of the divergence of what happened from what the sound network does, nats."""
-
-    log: NetworkLog
-    divergence: float
-
-
 def record(
     seed: Sequence[int], network: Network, slots: int, faults: Sequence[tuple[Fault, float]] = ()
-) -> Recording:
+) -> NetworkLog:
     """One episode from empty buffers under random access, the chance of sending drawn anew in every slot.
 
     Args:
         seed: of all draws; the same ones whatever the faults.
         network: traffic without memory.
         slots: length of the episode.
-        faults: each with its size; they act in this order.
+        faults: each with its size; they act in this order, those with a memory last.
     """
+    faults = sorted(faults, key=lambda one: one[0].follow is not None)
     uniform = np.random.default_rng(list(seed)).random((slots, network.devices + len(network.clusters) + 2))
     sets, sound = subsets(network.devices), sound_acks(network)
     place = 2 ** np.arange(network.devices)[::-1]
     buffer, arrival = np.zeros(network.devices, int), np.zeros(network.devices, int)
     memories = [fault.start(size) for fault, size in faults]
     columns: list[tuple[np.ndarray, ...]] = []
-    divergence = 0.0
     for slot in range(slots):
         u = uniform[slot]
         action = (u[1 : 1 + network.devices] < u[0]).astype(int)
         senders = int((action * (buffer > 0)) @ place)
-        rows, acks = _laws(network, sound, faults, memories, slot=slot, slots=slots, arrival=arrival)
-        divergence += _divergence(acks[senders], sound[senders])
-        divergence += sum(map(_divergence, rows, network.arrival[:, 0]))
+        pasts = [Past(slot, slot / slots, arrival, memory) for memory in memories]
+        rows, acks = _laws(network, sound, list(zip(faults, pasts, strict=True)))
         acked = _inverse(acks[senders], u[1 + network.devices])
+        for number, (fault, size) in enumerate(faults):
+            if fault.follow is not None:
+                others = [each for k, each in enumerate(zip(faults, pasts, strict=True)) if k != number]
+                chance = float(_laws(network, sound, others)[1][senders, acked])
+                memories[number] = fault.follow(memories[number], chance, acked == 0, size)
         arrival = _joint(
             network, [_inverse(row, v) for row, v in zip(rows, u[2 + network.devices :], strict=True)]
         )
-        for number, (fault, size) in enumerate(faults):
-            if fault.follow is not None:
-                chance = float(sound[senders, acked])
-                memories[number] = fault.follow(memories[number], chance, acked == 0, size)
         ack = sets[acked]
         columns.append((buffer, action, ack, arrival))
         buffer = np.clip(buffer + arrival - ack, 0, network.capacity)
     names = ("buffer", "action", "ack", "arrival")
     arrays = {name: np.stack(column) for name, column in zip(names, zip(*columns, strict=True), strict=True)}
-    log = NetworkLog(episode=np.zeros(slots, int), slot=np.arange(slots), **arrays)
-    return Recording(log, divergence)
+    return NetworkLog(episode=np.zeros(slots, int), slot=np.arange(slots), **arrays)
 
 
 def _laws(
-    network: Network,
-    sound: Acks,
-    faults: Sequence[tuple[Fault, float]],
-    memories: Sequence[float],
-    *,
-    slot: int,
-    slots: int,
-    arrival: np.ndarray,
+    network: Network, sound: Acks, faults: Sequence[tuple[tuple[Fault, float], Past]]
 ) -> tuple[Rows, Acks]:
+    """The laws of a slot with faults, each with its size and its past."""
     rows, acks = network.arrival[:, 0], sound
-    for (fault, size), memory in zip(faults, memories, strict=True):
-        past = Past(slot, slot / slots, arrival, memory)
+    for (fault, size), past in faults:
         rows = fault.arrivals(rows, past, size) if fault.arrivals else rows
         acks = fault.acks(acks, past, size) if fault.acks else acks
     return rows, acks
@@ -88,12 +72,6 @@ def sound_acks(network: Network) -> Acks:
     inside = np.all(sets[None] <= sets[:, None], axis=2)
     ways = np.array([[comb(int(n), int(d)) for d in sizes] for n in sizes])
     return np.where(inside, network.reception[sizes[:, None], sizes[None]] / np.maximum(ways, 1), 0.0)
-
-
-def _divergence(law: Float[np.ndarray, " outcome"], sound: Float[np.ndarray, " outcome"]) -> float:
-    """Kullback-Leibler divergence, nats; what the sound network cannot do counts as a chance of 1e-12."""
-    some = law > 0
-    return float(np.sum(law[some] * np.log(law[some] / np.maximum(sound[some], 1e-12))))
 
 
 def _inverse(law: Float[np.ndarray, " outcome"], uniform: float) -> int:

@@ -114,7 +114,7 @@ def _interferer(_rng: np.random.Generator, network: Network) -> Fault:
                         disturbed[senders, chosen] += chance * share / sets_of[senders, own]
         return (1 - size) * acks + size * disturbed
 
-    return Fault("interferer", None, acks=disturb)
+    return Fault("interferer", None, period=_CYCLE, acks=disturb)
 
 
 def _bursty_channel(_rng: np.random.Generator, network: Network) -> Fault:

@@ -49,7 +49,7 @@ def _disconnected(rng: np.random.Generator, network: Network) -> Fault:
         rows[cluster, with_] = 0.0
         return rows
 
-    return Fault("device_disconnected", f"device_{device}", 1.0, arrivals=silence)
+    return Fault("device_disconnected", f"device_{device}", 1.0, period=None, arrivals=silence)
 
 
 def _rate(rng: np.random.Generator, network: Network) -> Fault:
@@ -61,7 +61,12 @@ def _rate(rng: np.random.Generator, network: Network) -> Fault:
 def _drift(rng: np.random.Generator, network: Network) -> Fault:
     device = any_device(rng, network)
     add = _generate(network, device)
-    return Fault("drift", f"device_{device}", arrivals=lambda rows, past, size: add(rows, size * past.share))
+    return Fault(
+        "drift",
+        f"device_{device}",
+        period=None,
+        arrivals=lambda rows, past, size: add(rows, size * past.share),
+    )
 
 
 def _periodic(rng: np.random.Generator, network: Network) -> Fault:
@@ -71,7 +76,7 @@ def _periodic(rng: np.random.Generator, network: Network) -> Fault:
     def tick(rows: Rows, past: Past, size: float) -> Rows:
         return add(rows, size) if past.slot % _PERIOD == 0 else rows
 
-    return Fault("periodic_traffic", f"device_{device}", arrivals=tick)
+    return Fault("periodic_traffic", f"device_{device}", period=_PERIOD, arrivals=tick)
 
 
 def _bursty_traffic(rng: np.random.Generator, network: Network) -> Fault:

@@ -156,7 +156,11 @@ def rasterise(
 def _metal(
     scene: Scene2D, x: Float[np.ndarray, " nx"], y: Float[np.ndarray, " ny"], margin: float
 ) -> Bool[np.ndarray, "nx ny"]:
-    """Nodes in a conductor; a later rectangle of another medium takes out what is strictly inside it."""
+    """Nodes in a conductor; a later rectangle of another medium takes out what is strictly inside it.
+
+    Raises:
+        InputError: a conductor in the middle of the grid holds no node.
+    """
     metal = np.zeros((len(x), len(y)), bool)
     for each in scene.rectangles:
         grow = margin if each.medium.is_metal else -margin
@@ -164,8 +168,26 @@ def _metal(
             (nodes >= low - grow) & (nodes <= high + grow)
             for nodes, low, high in zip((x, y), each.lower, each.upper, strict=True)
         ]
+        if each.medium.is_metal:
+            _require_nodes(each, (x, y), inside)
         metal[np.ix_(*inside)] = each.medium.is_metal
     return metal
+
+
+def _require_nodes(
+    plate: Rectangle,
+    axes: tuple[Float[np.ndarray, " nx"], Float[np.ndarray, " ny"]],
+    inside: list[Bool[np.ndarray, " n"]],
+) -> None:
+    """Refuse a plate that lies between the lines of nodes, where it would vanish."""
+    reached = all(
+        low < nodes[-1] and high > nodes[0]
+        for nodes, low, high in zip(axes, plate.lower, plate.upper, strict=True)
+    )
+    if reached and not all(each.any() for each in inside):
+        expected = "a node of the grid on each axis"
+        remedy = "Make it thicker than the spacing, or the spacing finer"
+        raise InputError("metal rectangle", expected, f"none in {plate.lower} to {plate.upper}", remedy)
 
 
 def _edges(

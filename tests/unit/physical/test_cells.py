@@ -6,7 +6,8 @@ import json
 import numpy as np
 import pytest
 
-from dtprob.physical import custom_cases, labels_cases
+from dtprob.physical import custom_cases, disturbances, front_end, labels_cases
+from dtprob.physical.cases import _cells
 from dtprob.physical.cells import touched
 from dtprob.physical.multi_access import cases as network_cases
 from dtprob.physical.multi_access.faults import LISTED, draw
@@ -53,6 +54,28 @@ def test_every_track_makes_every_kind(track, tmp_path):
         if case["kind"] == "alias":
             assert case["alias"]["name"] != case["effects"][0]["name"]
             assert 0.2 < case["alias"]["correlation"] <= 1.0
+
+
+def test_traffic_of_one_device_touches_its_cluster(tmp_path):
+    for family in ("arrival_rate_shift", "periodic_traffic"):
+        folder = tmp_path / family
+        network_cases.TRACK.generate(folder, 1, 0, ("listed",), 60.0, families=(family,))
+        truth = json.loads((folder / "truth" / "0000.json").read_text())
+        device = int(truth["effects"][0]["instance"].removeprefix("device_"))
+        assert truth["cells"] == {"cluster": [device // 2]}
+
+
+def test_what_makes_the_noise_louder_touches_its_cells(bench, setting):
+    chain = disturbances.noise_imbalance(np.array([0.0, 2.0, 0.0, 0.0]))
+    quiet = disturbances.noise_imbalance(np.array([0.0, 0.0, -2.0, 0.0]))
+    assert touched_by(bench, chain, 1.0) == {"rx_antenna": [1]}
+    assert touched_by(bench, quiet, 1.0) == {"rx_antenna": [2]}
+    near = np.argmax(np.mean(np.abs(bench.base.mean) ** 2, axis=(1, 2, 3, 4)))
+    assert near in touched_by(bench, front_end.quantization(), 0.05)["link"]
+
+
+def touched_by(bench, impairment, size):
+    return _cells(bench, bench.simulate((impairment, size)), 1e4)
 
 
 def test_network_faults_are_like_themselves_and_unlike_the_others():

@@ -67,5 +67,15 @@ def test_stages_that_cannot_be_are_refused(stages):
 def test_other_devices_are_refused():
     with pytest.raises(InputError, match="the same devices"):
         ChangingNetwork([(0, Network.reference()), (5, Network.pairs(3))])
+    for actions in ({"device_0": 1}, {}):
+        with pytest.raises(InputError, match="an episode under way"):
+            changing_network().step(actions)
+
+
+def test_an_episode_that_is_over_takes_no_actions():
+    environment = changing_network(horizon=1)
+    environment.reset(seed=0)
+    environment.step(dict.fromkeys(environment.agents, 1))
+    assert environment.step({}) == ({}, {}, {}, {}, {})
     with pytest.raises(InputError, match="an episode under way"):
-        changing_network().step({"device_0": 1})
+        environment.step(dict.fromkeys(environment.possible_agents, 1))

@@ -34,6 +34,24 @@ def test_every_fault_keeps_a_law_and_does_nothing_at_size_zero(track, made, fami
     assert information(bench, fault.change(bench.law, 0.3 * fault.limit)) > 1.0
 
 
+def test_bursts_are_anywhere_in_a_run():
+    hit = np.zeros(fading.STEPS, bool)
+    for seed in range(20):
+        fault = fading.draw(np.random.default_rng(seed), "bursts", RUNS)
+        hit |= np.any(fault.change(RUNS.bench.law, 1.0).mean != RUNS.bench.law.mean, axis=0)
+    assert hit.all()
+
+
+@pytest.mark.parametrize("order", [("deeper_fading", "speed_change"), ("speed_change", "deeper_fading")])
+def test_fading_that_is_deeper_and_faster_is_both(order):
+    law = RUNS.bench.law
+    for family in ("own_level", *order, "gain_drift"):
+        law = fading.draw(np.random.default_rng(0), family, RUNS).change(law, 2.0)
+    late = 0.5 * (1 + np.tanh((np.linspace(0, 1, fading.STEPS) - 0.5) / 0.02))
+    both = RUNS.faded(RUNS.fading * (1 + 2 * late), np.cumsum(1 + 2 * late))
+    np.testing.assert_allclose(law.covariance, both + 4.0)
+
+
 def test_sound_laws_are_what_the_twins_can_fit():
     for bench in (STREETS.bench, RUNS.bench):
         np.testing.assert_allclose(bench.family(bench.start), bench.law.covariance, rtol=1e-9)
@@ -109,6 +127,16 @@ def test_the_same_bytes_again(folder, tmp_path):
     files = sorted(path.relative_to(tmp_path) for path in (tmp_path / "cases").rglob("*.*"))
     assert len(files) == 4
     assert all((tmp_path / file).read_bytes() == (folder / file).read_bytes() for file in files)
+
+
+def test_campaigns_are_of_a_kind_that_has_the_families(tmp_path):
+    for family, model in (("handover", "slow_fading"), ("wall", "path_loss")):
+        key = TRACK.generate(tmp_path / family, 9, 1, ("listed",), 60.0, families=(family,))
+        for case_ in json.loads(key.read_text())["cases"]:
+            assert case_["model"] == model
+            assert case_["effects"][0]["family"] == family
+    with pytest.raises(InputError, match="Name more families"):
+        TRACK.generate(tmp_path / "three", 1, 1, ("triple",), 60.0, families=fading.FAMILIES[1:3])
 
 
 def test_wrong_requests(tmp_path):

@@ -9,6 +9,7 @@ from dtprob.physical.information import (
     impulse_information,
     mean_information,
     power_information,
+    projected,
     size_for,
     spread_information,
 )
@@ -65,7 +66,26 @@ def test_spread_information_is_a_divergence():
     columns = circular(rng, (2, 3, 12))
     blocks = [0.2 / 2 * np.eye(24) + stack(one).T @ stack(one) for one in columns]
     joint = np.block([[blocks[0], np.zeros((24, 24))], [np.zeros((24, 24)), blocks[1]]])
-    assert spread_information(columns, 0.2, 24) == pytest.approx(gaussian_divergence(joint))
+    assert spread_information(columns, columns[0, :0], 0.2) == pytest.approx(gaussian_divergence(joint))
+
+
+@pytest.mark.parametrize("precision", [0.0, 30.0])
+def test_spread_that_the_twin_can_mimic_carries_no_information(precision):
+    rng = np.random.default_rng(3)
+    columns, tangents = circular(rng, (4, 3, 30)), circular(rng, (5, 120))
+    tangents[0] = 0.0
+    tangents[0, :30] = columns[0, 1]  # of unit size in one block
+    s2, prior = 0.2, np.full(5, precision)
+    every = np.zeros((12, 120), complex)
+    for block in range(4):
+        every[3 * block : 3 * block + 3, 30 * block : 30 * block + 30] = columns[block]
+    seen = np.stack([projected(one, tangents, s2, prior) for one in every])
+    extra = np.linalg.eigvalsh(stack(every) @ seen.T) / (s2 / 2)
+    expected = 240 * np.log1p(extra.sum() / 240) - np.log1p(extra).sum()
+    assert spread_information(columns, tangents, s2, prior) == pytest.approx(expected)
+    alone = np.pad(columns[:1, 1:2], ((0, 3), (0, 0), (0, 0)))
+    found = spread_information(alone, tangents, s2, prior)
+    assert found < 1e-6 if precision == 0 else found > 1
 
 
 def test_power_and_colour_are_divergences():

@@ -1,6 +1,7 @@
 """Surveys of labels with faults: laws, information in closed form, and the same bytes from the same seed."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from dtprob.case import load_case
 from dtprob.data import read
 from dtprob.errors import InputError
 from dtprob.physical.fault_cases import Families, choose
-from dtprob.physical.gaussian import Bench, Law, information, louder, measure, shifted, sized, visible
+from dtprob.physical.gaussian import Bench, Law, information, louder, measure, shifted, shown, sized, visible
 from dtprob.physical.labels_cases import TRACK
 from dtprob.physical.labels_faults import FAMILIES, FOREIGN, LISTED, draw
 from dtprob.physical.labels_survey import BLOCKS, EAST, NORTH, ROWS, make_survey
@@ -34,7 +35,36 @@ def test_every_fault_keeps_a_law_and_does_nothing_at_size_zero(family):
     np.testing.assert_allclose(sound.covariance, BENCH.law.covariance, atol=1e-9)
     assert np.linalg.eigvalsh(faulty.covariance).min() > 0
     np.testing.assert_allclose(faulty.covariance, np.swapaxes(faulty.covariance, 1, 2))
-    assert information(BENCH, faulty) > 0
+    assert information(BENCH, fault.change(BENCH.law, 0.3 * fault.limit)) > 0.1
+
+
+def test_a_saturated_receiver_shows_no_more_than_its_largest_level():
+    fault = draw(np.random.default_rng(0), "saturation", SURVEY)
+    assert information(BENCH, fault.change(BENCH.law, 0.0)) < 1e-3
+    found = sized(BENCH, fault, 100.0)
+    law = fault.change(BENCH.law, found.size)
+    drawn = np.stack([measure(np.random.default_rng(k), law) for k in range(400)])
+    assert drawn.max() == law.ceiling
+    assert found.size == pytest.approx(SURVEY.prediction.max() + 5 * SURVEY.deviation - law.ceiling)
+    seen, deviation = shown(law), SURVEY.deviation
+    variance = np.einsum("bii->bi", seen.covariance)
+    np.testing.assert_allclose(drawn.mean(axis=0), seen.mean, atol=4.5 * deviation / 20)
+    np.testing.assert_allclose(drawn.var(axis=0), variance, atol=4.5 * np.sqrt(2) * deviation**2 / 20)
+    left = seen.mean - BENCH.law.mean
+    expected = N * np.log(np.mean(variance + left**2)) - np.log(variance).sum()
+    assert found.lambda_ == pytest.approx(expected, rel=1e-4)
+
+
+def test_neighbours_that_err_alike_saturate_alike():
+    fault = draw(np.random.default_rng(0), "autocorrelated_errors", SURVEY)
+    law = replace(fault.change(BENCH.law, 0.5), ceiling=float(np.median(SURVEY.prediction)))
+    drawn = np.stack([measure(np.random.default_rng(k), law) for k in range(3000)])
+    lag = np.mean(drawn[:, :, 1:] * drawn[:, :, :-1], axis=0) - drawn[:, :, 1:].mean(axis=0) * drawn[
+        :, :, :-1
+    ].mean(axis=0)
+    found = np.diagonal(shown(law).covariance, offset=1, axis1=1, axis2=2)
+    assert np.linalg.eigvalsh(shown(law).covariance).min() > 0
+    assert found.sum() == pytest.approx(lag.sum(), rel=0.05)
 
 
 def test_information_of_a_shift_is_the_logarithm_of_the_grown_variance():

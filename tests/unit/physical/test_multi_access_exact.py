@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from dtprob.errors import InputError
-from dtprob.physical.multi_access import Network, aloha, average, chain, improve, optimum, slopes, tdma
+from dtprob.physical.multi_access import (
+    Network,
+    aloha,
+    average,
+    chain,
+    improve,
+    optimum,
+    reception,
+    slopes,
+    tdma,
+)
 
 NETWORK = Network.reference()
 PAIRS, ACROSS, TURNS = [[0, 1], [2, 3]], [[0, 2], [1, 3]], [[0], [1], [2], [3]]
@@ -112,6 +122,15 @@ def test_ascent_ends_where_no_single_decision_helps():
         other = found.rule.copy()
         other[place] = 1 - other[place]
         assert average(one, other).throughput <= found.averages.throughput + 1e-9
+
+
+def test_ascent_leaves_a_saddle():
+    """Two devices of which one alone is heard: no single chance matters at one half, two together do."""
+    network = Network(((0,), (1,)), 1, np.tile([0.0, 1.0], (2, 1, 1)), reception([1.0], [0.0], senders=2))
+    for chance in (0.4, 0.5, 0.6):
+        found = improve(chain(network), aloha(network, chance))
+        assert found.averages.throughput == pytest.approx(1.0)
+        assert set(np.unique(found.rule)) <= {0.0, 1.0}
 
 
 def test_what_cannot_be_solved_says_so(reference):

@@ -9,6 +9,8 @@ from dtprob.errors import InputError
 from dtprob.physical import disturbances, front_end
 from dtprob.physical.channel import Sounding, mean_power, subcarriers
 from dtprob.physical.impairment import thermal
+from dtprob.physical.information import power_information
+from dtprob.physical.noise import rounding
 from dtprob.physical.waveform import chirp, resample, symmetric_pilot, to_frequency, to_time
 
 SHAPE = (40, 3, 4, 2, 16)
@@ -98,6 +100,38 @@ def test_quantization_adds_the_power_of_its_step():
     error = law.measure(rng, channel, SOUNDING) - channel
     assert mean_power(error) == pytest.approx(law.mean_power(SHAPE), rel=0.05)
     assert law.mean_power(SHAPE) == pytest.approx(0.01 + 0.16 * mean_power(channel) / 6, rel=0.01)
+
+
+@pytest.mark.parametrize("size", [0.05, 0.3, 0.8, 1.5])
+def test_rounding_shifts_the_mean_and_leaves_a_variance(size):
+    rng = np.random.default_rng(2)
+    channel = rng.standard_normal((2, 1, 1, 2, 16)) + 1j * rng.standard_normal((2, 1, 1, 2, 16))
+    made = front_end.quantization().noise
+    assert made is not None
+    law = made(thermal(0.04), channel, SOUNDING, size)
+    found = np.stack([law.measure(rng, channel, SOUNDING) for _ in range(2000)]) - channel
+    shift, variance = rounding(channel, law.power, law.step, SOUNDING)
+    deviation = np.sqrt(variance / 2000)
+    assert np.max(np.abs(found.mean(axis=0) - shift) / deviation) < 4
+    seen = np.mean(found.var(axis=0), axis=-1, keepdims=True)
+    np.testing.assert_allclose(seen, variance, rtol=0.1)
+
+
+def test_a_coarse_step_tells_by_the_shift_that_repeats():
+    """Links of one level have noise of one level; what is left is twice the square of the shift over the noise."""
+    rng = np.random.default_rng(3)
+    channel = np.exp(2j * np.pi * rng.random((20, 2, 1, 1, 16)))
+    made = front_end.quantization().noise
+    assert made is not None
+    law = made(thermal(0.02), channel, SOUNDING, 0.3)  # three deviations of each branch
+    shift, variance = rounding(channel, law.power, law.step, SOUNDING)
+    none = np.zeros((0, channel.size), complex)
+    told = 2 * np.sum(np.abs(shift) ** 2) / np.mean(variance)
+    scatter = power_information(np.broadcast_to(variance, channel.shape))
+    assert told > 3
+    assert law.information(channel, SOUNDING, none) == pytest.approx(told + scatter, rel=0.05)
+    known = shift.reshape(1, -1)
+    assert law.information(channel, SOUNDING, known) == pytest.approx(scatter, abs=1e-3)
 
 
 def test_a_quantized_link_has_few_levels():

@@ -111,6 +111,13 @@ def test_an_edit_in_the_street_changes_what_it_should():
     np.testing.assert_allclose(metal.gain[:, 0][~met], base.gain[:, 0][~met])
 
 
+def test_what_was_done_to_a_removed_object_does_not_matter():
+    gone = remove_object(street(2), "building_4")
+    edited = turn_object(move_object(gone, "building_4", (0.0, 0.1, 0.0)), "building_4", 0.1)
+    edited = swap_material(edited, "building_4", HALF_SPACE)
+    np.testing.assert_array_equal(trace(edited).unfolded, trace(gone).unfolded)
+
+
 def test_a_part_is_put_into_the_street():
     from sionna import rt
 

@@ -64,6 +64,19 @@ def test_metal_is_where_it_is_drawn_and_no_further():
     assert np.array_equal(metal, expected)
 
 
+def test_metal_that_would_vanish_between_the_nodes_is_refused():
+    nodes = np.arange(6.0)
+
+    def metal(plate):
+        return rasterise(Scene2D((0.0, 0.0), (5.0, 5.0), (plate,)), nodes, nodes, itself).metal
+
+    with pytest.raises(InputError, match="metal rectangle: expected a node of the grid"):
+        metal(Rectangle((4.2, 1.0), (4.8, 3.0), METAL))
+    assert not metal(Rectangle((4.2, 1.0), (4.8, 3.0), CONCRETE)).any()
+    assert not metal(Rectangle((7.2, 1.0), (7.8, 3.0), METAL)).any()
+    assert metal(Rectangle((4.2, 1.0), (5.2, 3.0), METAL)).sum() == 3
+
+
 @pytest.mark.parametrize("angle", [0.0, 0.3, math.pi / 4, 1.2])
 def test_plane_waves_obey_the_dispersion_relation(angle):
     """A plane wave of the closed form's wavenumber goes through one time step of the scheme as it should."""
