@@ -19,7 +19,7 @@ from dtprob.physical.bench import Bench
 from dtprob.physical.campaign import Plan, Site, describe, make_site
 from dtprob.physical.case_files import write_case
 from dtprob.physical.cells import touched
-from dtprob.physical.choose import KINDS, LISTED, choose
+from dtprob.physical.choose import KINDS, LISTED, TAKEN_OUT, choose
 from dtprob.physical.draws import FAMILIES
 from dtprob.physical.impairment import Simulation, measure
 from dtprob.physical.information import projected
@@ -51,6 +51,8 @@ def _case(plan: Plan, out: Path, order: Order, site: Site) -> dict[str, Any]:
     """Measure and write one case; beside its record lies the noiseless channel with and without the effects."""
     choice = choose(order.rng, order.kind, site, order.lambda_, order.families)
     bench = site.bench
+    there = [*(one.impairment.name for one in choice.effects), *([choice.alias[0]] if choice.alias else [])]
+    left_out = order.left_out(choice.excluded, there, order.families, TAKEN_OUT)
     simulation = bench.simulate(*((one.impairment, one.size) for one in choice.effects))
     channel = measure(order.rng, simulation, bench.sounding)
     write_case(
@@ -62,7 +64,7 @@ def _case(plan: Plan, out: Path, order: Order, site: Site) -> dict[str, Any]:
         noise_power=site.recorded_noise,
         model=plan.model,
         phase=plan.phase,
-        excluded=choice.excluded,
+        excluded=left_out,
         seed=order.index,
     )
     truth = f"truth/{order.name}.npz"
@@ -70,7 +72,7 @@ def _case(plan: Plan, out: Path, order: Order, site: Site) -> dict[str, Any]:
         np.savez(temporary, base=bench.base.mean, noiseless=simulation.mean)
     return order.record(
         [one.record() for one in choice.effects],
-        choice.excluded,
+        left_out,
         alias={"name": choice.alias[0], "correlation": choice.alias[1]} if choice.alias else None,
         cells=_cells(bench, simulation, sum(one.lambda_ for one in choice.effects)),
         gap_db=_gap_db(simulation, bench.base),

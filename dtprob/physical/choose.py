@@ -22,6 +22,8 @@ FOREIGN: Final = ("beam_squint", "correlated_noise", "dispersive_walls", "pedest
 LISTED: Final = tuple(name for name in FAMILIES if name not in FOREIGN)
 APART: Final = 0.5
 """Effects of one case correlate less than this in what the twin's free parameters cannot mimic."""
+TAKEN_OUT: Final = 2 / 3
+"""Share of the unlisted causes whose family is taken out of the library; the others never had an entry."""
 _TRIES: Final = 60
 _TOLERANCE: Final = 0.15
 _POOL: Final = 12
@@ -90,7 +92,7 @@ def choose(rng: np.random.Generator, kind: str, site: Site, target: float, famil
     if kind == "listed":
         return Choice((_sized(rng, site, target, families),))
     if kind == "unlisted":
-        if rng.random() < 1 / 3:
+        if rng.random() < 1 - TAKEN_OUT:
             return Choice((_sized(rng, site, target, FOREIGN),))
         one = _sized(rng, site, target, families)
         return Choice((one,), excluded=(one.impairment.family,))

@@ -14,6 +14,8 @@ from dtprob.physical.gaussian import Bench, Fault, Law, Sized, Vector, measure, 
 from dtprob.physical.study import Order
 
 KINDS: Final = ("null", "listed", "unlisted", "pair", "triple", "alias")
+_TAKEN_OUT: Final = 0.5
+"""Share of the unlisted causes whose family is taken out of the library; the others never had an entry."""
 _TRIES: Final = 60
 _PATIENCE: Final = 8
 """Faults that may be too much like the others before these are drawn anew."""
@@ -62,7 +64,7 @@ def choose(rng: np.random.Generator, kind: str, bench: Bench, target: float, fam
     """
     if kind == "null":
         return Choice()
-    if kind == "unlisted" and rng.random() < 0.5:
+    if kind == "unlisted" and rng.random() < 1 - _TAKEN_OUT:
         return Choice((_one(rng, bench, target, families, families.foreign),))
     if kind == "alias":
         return _aliased(rng, bench, target, families)
@@ -188,10 +190,12 @@ def make_case(out: Path, order: Order, setup: Setup) -> dict[str, Any]:
     for one in choice.faults:
         law = one.fault.change(law, one.size)
     measured = measure(np.random.default_rng([order.seed, order.index, 2]), law)
-    setup.write(out / "cases" / order.name, measured, choice.excluded, order.index)
+    there = [*(one.fault.name for one in choice.faults), *([choice.alias["name"]] if choice.alias else [])]
+    left_out = order.left_out(choice.excluded, there, setup.families.known, _TAKEN_OUT)
+    setup.write(out / "cases" / order.name, measured, left_out, order.index)
     return order.record(
         [one.record() for one in choice.faults],
-        choice.excluded,
+        left_out,
         choice.alias,
         cells=setup.cells(law, sum(one.lambda_ for one in choice.faults)),
         **setup.more,

@@ -54,6 +54,26 @@ class Order:
         """Of the case's folder and record."""
         return f"{self.index:04d}"
 
+    def left_out(
+        self, excluded: Sequence[str], there: Iterable[str], known: Sequence[str], share: float
+    ) -> tuple[str, ...]:
+        """Families that the case takes out of the library: those of an unlisted cause, or as often an innocent one.
+
+        Otherwise a case would tell its kind.
+
+        Args:
+            excluded: families of the cause.
+            there: names of effects of the case, and of what looks like them; their families stay.
+            known: families that the library has.
+            share: of the unlisted cases whose family is taken out.
+        """
+        if excluded or self.kind == "unlisted":
+            return tuple(excluded)
+        rng = np.random.default_rng([self.seed, self.index, 9])
+        families = {name.split("[")[0] for name in there}
+        innocent = [family for family in known if family not in families]
+        return (str(rng.choice(innocent)),) if innocent and rng.random() < share else ()
+
     def record(
         self,
         effects: Sequence[Mapping[str, Any]],

@@ -28,6 +28,8 @@ from dtprob.physical.multi_access.network import Network, reception
 from dtprob.physical.study import Order, Track, case_end
 
 KINDS: Final = ("null", "listed", "unlisted", "pair", "triple", "alias")
+_TAKEN_OUT: Final = 2 / 3
+"""Share of the unlisted causes whose family is taken out of the library; the others never had an entry."""
 BEFORE, AFTER, WINDOW = 3000, 600, 10
 CONVENTION: Final = (
     "lambda is twice the divergence of the law of both logs from that of one network whose tables are fitted to both;"
@@ -83,10 +85,12 @@ def _case(out: Path, order: Order, network: Network) -> dict[str, Any]:
     write(folder / "before.csv", record((*draws, 2), network, BEFORE))
     after = record((*draws, 3), network, AFTER, [(one.fault, one.size) for one in faults])
     write(folder / "after.csv", after)
-    write_text(folder / "case.toml", _MODEL + case_end(excluded, order.index))
+    there = [*(one.fault.name for one in faults), *([alias["name"]] if alias else [])]
+    left_out = order.left_out(excluded, there, order.families, _TAKEN_OUT)
+    write_text(folder / "case.toml", _MODEL + case_end(left_out, order.index))
     about = {"arrival": network.arrival.tolist(), "reception": network.reception.tolist()}
     effects = [one.record() for one in faults]
-    return order.record(effects, excluded, alias, cells=_cells(network, faults), **about)
+    return order.record(effects, left_out, alias, cells=_cells(network, faults), **about)
 
 
 def _cells(network: Network, faults: Sequence[_Active]) -> dict[str, list[int]]:
@@ -119,7 +123,7 @@ def _choose(
     """What a case holds."""
     if kind == "null":
         return _Choice()
-    if kind == "unlisted" and rng.random() < 1 / 3:
+    if kind == "unlisted" and rng.random() < 1 - _TAKEN_OUT:
         return _Choice((_sized(rng, network, target, FOREIGN),))
     if kind == "alias":
         return _aliased(rng, network, target, families)

@@ -2,10 +2,12 @@
 
 import json
 
+import numpy as np
 import pytest
+from scipy import stats
 
 from dtprob.errors import InputError
-from dtprob.physical.study import Track
+from dtprob.physical.study import Order, Track
 
 
 def track(most, drawn=None):
@@ -54,6 +56,19 @@ def test_a_folder_holds_one_study(tmp_path):
     (tmp_path / "study.json").unlink()
     with pytest.raises(InputError, match="another study"):
         track(2.0).generate(tmp_path, 5, 0, lambda_=1.0, resume=True)
+
+
+def test_a_case_does_not_tell_its_kind_by_what_it_leaves_out():
+    """As often as for unlisted causes a family is left out, but none that the case holds."""
+    found = []
+    for index in range(2000):
+        order = Order(index, 0, "listed", 1.0, ("a", "b", "c"), np.random.default_rng(0))
+        found.append(order.left_out((), ["a[1]"], order.families, 2 / 3))
+    assert {family for one in found for family in one} == {"b", "c"}
+    assert stats.binomtest(sum(map(len, found)), 2000, 2 / 3).pvalue > 1e-3
+    unlisted = Order(0, 0, "unlisted", 1.0, ("a", "b"), np.random.default_rng(0))
+    assert unlisted.left_out(("a",), ["a"], ("a", "b"), 1.0) == ("a",)
+    assert unlisted.left_out((), ["foreign"], ("a", "b"), 1.0) == ()
 
 
 def test_what_no_campaign_can_carry_is_refused(tmp_path):
