@@ -46,10 +46,11 @@ class Rewriting(Changing):
         self._effects, self._parameters, self._data = tuple(effects), parameters, data
         self._seen: dict[str, Any] = {}
         self._fields: dict[str, jax.Array] = {}
+        self._drawn: dict[str, dist.Distribution] = {}
 
     def __enter__(self) -> Any:
         """Start a run: nothing seen, no field drawn."""
-        self._seen, self._fields = {}, {}
+        self._seen, self._fields, self._drawn = {}, {}, {}
         return super().__enter__()
 
     def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -57,6 +58,10 @@ class Rewriting(Changing):
         super().process_message(msg)
         if msg["type"] != "sample":
             return
+        if (
+            msg["name"] in self._drawn
+        ):  # a field counts once, whatever masks and scales the model has around the site
+            msg["fn"], msg["scale"] = self._drawn[msg["name"]], None
         context = Context(self._data, self._seen)
         for effect in self._effects:
             if msg["name"] in effect.distributions:
@@ -99,6 +104,7 @@ class Rewriting(Changing):
             # The field has its own shape, so the plates around the site must not expand it.
             plates = [frame.name for frame in msg["cond_indep_stack"]]
             name = effect.site_name(FIELD)
+            self._drawn[name] = normal
             drawn = numpyro.sample(name, normal, infer={"block_plates": plates})
             self._fields[effect.name] = jnp.asarray(drawn)
         return {**given, FIELD: self._fields[effect.name]}
