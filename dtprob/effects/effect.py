@@ -135,7 +135,8 @@ class Effect:
         family: name of the physics, e.g. "timing_offset".
         rewrites: for each deterministic site, the function (value, parameters, context) -> new value. The new
             value has the rank of the old one and its shape, except that an axis of size 1 may grow (as when a
-            phase that was the same in all snapshots starts to turn); it is cast to the old dtype.
+            phase that was the same in all snapshots starts to turn); it is cast to the old dtype, whole numbers
+            becoming real ones.
         parameters: the effect's parameters.
         instance: which object, antenna, band or device; None where there is only one.
         kind: "mean" for parameters that shift the site's value; "variance" for a random field whose standard

@@ -151,7 +151,10 @@ def may_become(old: Sequence[int], new: Sequence[int]) -> bool:
 
 
 def _fit(effect: str, site: str, old: Any, new: Any) -> jax.Array:
-    """The new value in the old dtype, after a check that it can stand where the old one stood."""
+    """The new value in the old dtype, after a check that it can stand where the old one stood.
+
+    Real numbers in the place of whole ones stay real: cut off to whole ones, a small effect would be none.
+    """
     old, new = jnp.asarray(old), jnp.asarray(new)
     if not may_become(old.shape, new.shape):
         raise InputError(
@@ -167,7 +170,8 @@ def _fit(effect: str, site: str, old: Any, new: Any) -> jax.Array:
             str(new.dtype),
             "Return real values.",
         )
-    return new.astype(old.dtype)
+    whole = not jnp.issubdtype(old.dtype, jnp.inexact) and jnp.issubdtype(new.dtype, jnp.inexact)
+    return new.astype(jnp.result_type(old.dtype, float) if whole else old.dtype)
 
 
 def with_effects(model: Model, effects: Sequence[Effect]) -> Model:

@@ -198,6 +198,16 @@ def test_dtype_stays_that_of_the_site():
     assert value.dtype == jnp.float32
 
 
+@pytest.mark.parametrize("values", [jnp.arange(6), jnp.arange(6) > 2], ids=["whole", "boolean"])
+def test_a_site_of_whole_numbers_takes_real_ones(values):
+    with Rewriting(None, [BEND], {"bend": {"curvature": 0.1}}, DATA):
+        value = numpyro.deterministic("mean", values)
+    np.testing.assert_allclose(value, values + 0.1 * DATA["x"] ** 2)
+    up = Effect("up", {"mean": lambda value, p, _: value + 2}, BEND.parameters)
+    with Rewriting(None, [up], {"up": {"curvature": 0.1}}, DATA):
+        assert numpyro.deterministic("mean", jnp.arange(6)).dtype == jnp.arange(6).dtype
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
