@@ -55,7 +55,7 @@ class Parameter:
     labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that what is looked for at several values is one place, and that each entry has its label."""
+        """Check that each entry has its label, what is tried is one place, and no size can only be below its null."""
         if self.labels and len(self.labels) != self.size:
             got = f"{len(self.labels)}"
             raise InputError(
@@ -65,6 +65,11 @@ class Parameter:
             expected = "is_place=True and a normal prior of one number where values are tried"
             got = f"is_place={self.is_place}, {type(self.prior).__name__} of shape {self.shape}"
             raise InputError(f"parameter {self.name}", expected, got, "Leave tried out, or make it a place.")
+        upper = getattr(self._support, "upper_bound", None)
+        if not self.is_place and upper is not None and np.any(np.asarray(upper) == self.null):
+            expected = f"a prior that reaches above the null {self.null:g}"
+            remedy = f"Write the effect with the other sign, so that {self.name} is at its null or above."
+            raise InputError(f"parameter {self.name}", expected, "one that ends there", remedy)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -99,13 +104,19 @@ class Parameter:
     @property
     def is_one_sided(self) -> bool:
         """Whether the null lies at the lower edge of what the prior allows, as for an attenuation."""
-        support: Any = self.prior.support
-        while hasattr(support, "base_constraint"):
-            support = support.base_constraint
+        support = self._support
         if support in (constraints.positive, constraints.nonnegative):
             return self.null == 0.0
         lower = getattr(support, "lower_bound", None)
         return lower is not None and bool(np.all(np.asarray(lower) == self.null))
+
+    @property
+    def _support(self) -> Any:
+        """What values an entry may take."""
+        support: Any = self.prior.support
+        while hasattr(support, "base_constraint"):
+            support = support.base_constraint
+        return support
 
 
 class Context(Mapping[str, Any]):

@@ -178,6 +178,25 @@ def test_one_sided(prior, null, expected):
     assert Parameter("p", prior, null).is_one_sided is expected
 
 
+@pytest.mark.parametrize(
+    ("prior", "null"),
+    [
+        (dist.Uniform(-3.0, 0.0), 0.0),
+        (dist.Uniform(-3.0, 0.0).expand((2,)).to_event(1), 0.0),
+        (dist.TruncatedNormal(0.0, 1.0, high=0.0), 0.0),
+        (dist.Beta(5.0, 1.0), 1.0),
+    ],
+    ids=["uniform", "vector", "truncated", "share"],
+)
+def test_a_size_that_can_only_be_below_its_null_is_refused(prior, null):
+    """It would be tested on both sides, and so be seen where its prior excludes it."""
+    with pytest.raises(
+        InputError, match=r"parameter db: .*got one that ends there\. Write the effect with the other sign"
+    ):
+        Parameter("db", prior, null)
+    assert not Parameter("edge", prior, null, is_place=True).is_one_sided
+
+
 def test_values_that_a_site_cannot_take():
     def rewriting(rewrite):
         effect = Effect("wrong", {"mean": rewrite}, (Parameter("p", dist.Normal(0.0, 1.0)),))
