@@ -28,6 +28,8 @@ type EffectKind = Literal["mean", "variance"]
 FIELD = "field"
 _PRIOR_DRAWS: Final = 4001
 """Draws that tell how far a prior without a variance reaches."""
+_QUARTILE: Final = float(stats.norm.ppf(0.75))
+"""Median distance of a standard normal from its middle."""
 
 
 @dataclass(frozen=True)
@@ -88,10 +90,10 @@ class Parameter:
         while isinstance(base, dist.ExpandedDistribution | dist.Independent):
             base = base.base_dist
         if isinstance(base, dist.HalfNormal | dist.HalfCauchy):
-            return np.asarray(base.scale)
+            return np.asarray(base.scale) * _stray(base)
         if isinstance(base, dist.Normal | dist.StudentT | dist.Cauchy):
             away = 0.0 if self.is_place else np.asarray(base.loc) - self.null
-            return np.hypot(np.asarray(base.scale), away)
+            return np.hypot(np.asarray(base.scale) * _stray(base), away)
         try:
             square = np.asarray(self.prior.variance) + (np.asarray(self.prior.mean) - self.null) ** 2
         except NotImplementedError:
@@ -99,7 +101,7 @@ class Parameter:
         if np.isfinite(square).all():
             return np.sqrt(square)
         strays = np.abs(np.asarray(self.prior.sample(jax.random.key(0), (_PRIOR_DRAWS,))) - self.null)
-        return np.median(strays, axis=0) / stats.norm.ppf(0.75)
+        return np.median(strays, axis=0) / _QUARTILE
 
     @property
     def is_one_sided(self) -> bool:
@@ -117,6 +119,18 @@ class Parameter:
         while hasattr(support, "base_constraint"):
             support = support.base_constraint
         return support
+
+
+def _stray(base: Any) -> Any:
+    """Root mean square distance from the middle, or a normal one's of the same median, in units of the scale."""
+    if isinstance(base, dist.Cauchy | dist.HalfCauchy):
+        return 1.0 / _QUARTILE
+    if not isinstance(base, dist.StudentT):
+        return 1.0
+    freedom = np.asarray(base.df, float)
+    has_square = freedom > 2
+    square = freedom / np.where(has_square, freedom - 2, 1.0)
+    return np.where(has_square, np.sqrt(square), stats.t.ppf(0.75, freedom) / _QUARTILE)
 
 
 class Context(Mapping[str, Any]):

@@ -161,42 +161,6 @@ def test_nesting_makes_no_difference(order, cuts):
         assert not np.allclose(one, other)  # else the test could not fail
 
 
-@pytest.mark.parametrize(
-    ("prior", "null", "expected"),
-    [
-        (dist.HalfNormal(1.0), 0.0, True),
-        (dist.Normal(0.0, 1.0), 0.0, False),
-        (dist.HalfNormal(1.0).expand((3,)).to_event(1), 0.0, True),
-        (dist.Uniform(0.0, 1.0), 0.0, True),
-        (dist.Uniform(0.0, 1.0), 0.5, False),
-        (dist.LogNormal(0.0, 1.0), 1.0, False),
-        (dist.Beta(1.0, 5.0), 0.0, True),
-        (dist.TruncatedNormal(0.0, 1.0, low=0.0), 0.0, True),
-    ],
-)
-def test_one_sided(prior, null, expected):
-    assert Parameter("p", prior, null).is_one_sided is expected
-
-
-@pytest.mark.parametrize(
-    ("prior", "null"),
-    [
-        (dist.Uniform(-3.0, 0.0), 0.0),
-        (dist.Uniform(-3.0, 0.0).expand((2,)).to_event(1), 0.0),
-        (dist.TruncatedNormal(0.0, 1.0, high=0.0), 0.0),
-        (dist.Beta(5.0, 1.0), 1.0),
-    ],
-    ids=["uniform", "vector", "truncated", "share"],
-)
-def test_a_size_that_can_only_be_below_its_null_is_refused(prior, null):
-    """It would be tested on both sides, and so be seen where its prior excludes it."""
-    with pytest.raises(
-        InputError, match=r"parameter db: .*got one that ends there\. Write the effect with the other sign"
-    ):
-        Parameter("db", prior, null)
-    assert not Parameter("edge", prior, null, is_place=True).is_one_sided
-
-
 def test_values_that_a_site_cannot_take():
     def rewriting(rewrite):
         effect = Effect("wrong", {"mean": rewrite}, (Parameter("p", dist.Normal(0.0, 1.0)),))
@@ -239,13 +203,6 @@ def test_a_site_of_whole_numbers_takes_real_ones(values):
 def test_incomplete_declarations_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         Effect(**{**vars(BEND), **changes})
-
-
-def test_labels_are_one_for_each_entry():
-    prior = dist.Normal(0.0, 1.0).expand([2]).to_event(1)
-    assert Parameter("gain", prior, labels=("left", "right")).labels == ("left", "right")
-    with pytest.raises(InputError, match="labels of parameter gain: expected 2, one for each entry, got 3"):
-        Parameter("gain", prior, labels=("x", "y", "z"))
 
 
 def test_context_prefers_sites_to_data():
