@@ -181,9 +181,10 @@ def n_snapshot(sites: Sites) -> int:
     return max((site.shape[site.axes.index("snapshot")] for site in observed), default=1)
 
 
-def n_link(context: Data) -> int:
-    """Number of links in this run of a model with paths."""
-    return context["path_gain"].shape[0]
+def links_and_paths(phase: Float[Array, "link snapshot path"], context: Data) -> tuple[int, int]:
+    """Numbers of links and paths in this run, by the gains if the model computes these: one phase may be for all."""
+    links, _, paths = context["path_gain"][:, None].shape if "path_gain" in context else phase.shape
+    return links, paths
 
 
 def n_antenna(sites: Sites, side: str) -> int:

@@ -28,6 +28,8 @@ type EffectKind = Literal["mean", "variance"]
 FIELD = "field"
 _PRIOR_DRAWS: Final = 4001
 """Draws that tell how far a prior without a variance reaches."""
+_QUARTILE: Final = float(stats.norm.ppf(0.75))
+"""Median distance of a standard normal from its middle."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class Parameter:
     labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that what is looked for at several values is one place, and that each entry has its label."""
+        """Check that each entry has its label, what is tried is one place, and no size can only be below its null."""
         if self.labels and len(self.labels) != self.size:
             got = f"{len(self.labels)}"
             raise InputError(
@@ -65,6 +67,11 @@ class Parameter:
             expected = "is_place=True and a normal prior of one number where values are tried"
             got = f"is_place={self.is_place}, {type(self.prior).__name__} of shape {self.shape}"
             raise InputError(f"parameter {self.name}", expected, got, "Leave tried out, or make it a place.")
+        upper = getattr(self._support, "upper_bound", None)
+        if not self.is_place and upper is not None and np.any(np.asarray(upper) == self.null):
+            expected = f"a prior that reaches above the null {self.null:g}"
+            remedy = f"Write the effect with the other sign, so that {self.name} is at its null or above."
+            raise InputError(f"parameter {self.name}", expected, "one that ends there", remedy)
 
     @property
     def shape(self) -> tuple[int, ...]:
@@ -83,10 +90,10 @@ class Parameter:
         while isinstance(base, dist.ExpandedDistribution | dist.Independent):
             base = base.base_dist
         if isinstance(base, dist.HalfNormal | dist.HalfCauchy):
-            return np.asarray(base.scale)
+            return np.asarray(base.scale) * _stray(base)
         if isinstance(base, dist.Normal | dist.StudentT | dist.Cauchy):
             away = 0.0 if self.is_place else np.asarray(base.loc) - self.null
-            return np.hypot(np.asarray(base.scale), away)
+            return np.hypot(np.asarray(base.scale) * _stray(base), away)
         try:
             square = np.asarray(self.prior.variance) + (np.asarray(self.prior.mean) - self.null) ** 2
         except NotImplementedError:
@@ -94,18 +101,36 @@ class Parameter:
         if np.isfinite(square).all():
             return np.sqrt(square)
         strays = np.abs(np.asarray(self.prior.sample(jax.random.key(0), (_PRIOR_DRAWS,))) - self.null)
-        return np.median(strays, axis=0) / stats.norm.ppf(0.75)
+        return np.median(strays, axis=0) / _QUARTILE
 
     @property
     def is_one_sided(self) -> bool:
         """Whether the null lies at the lower edge of what the prior allows, as for an attenuation."""
-        support: Any = self.prior.support
-        while hasattr(support, "base_constraint"):
-            support = support.base_constraint
+        support = self._support
         if support in (constraints.positive, constraints.nonnegative):
             return self.null == 0.0
         lower = getattr(support, "lower_bound", None)
         return lower is not None and bool(np.all(np.asarray(lower) == self.null))
+
+    @property
+    def _support(self) -> Any:
+        """What values an entry may take."""
+        support: Any = self.prior.support
+        while hasattr(support, "base_constraint"):
+            support = support.base_constraint
+        return support
+
+
+def _stray(base: Any) -> Any:
+    """Root mean square distance from the middle, or a normal one's of the same median, in units of the scale."""
+    if isinstance(base, dist.Cauchy | dist.HalfCauchy):
+        return 1.0 / _QUARTILE
+    if not isinstance(base, dist.StudentT):
+        return 1.0
+    freedom = np.asarray(base.df, float)
+    has_square = freedom > 2
+    square = freedom / np.where(has_square, freedom - 2, 1.0)
+    return np.where(has_square, np.sqrt(square), stats.t.ppf(0.75, freedom) / _QUARTILE)
 
 
 class Context(Mapping[str, Any]):
@@ -135,7 +160,8 @@ class Effect:
         family: name of the physics, e.g. "timing_offset".
         rewrites: for each deterministic site, the function (value, parameters, context) -> new value. The new
             value has the rank of the old one and its shape, except that an axis of size 1 may grow (as when a
-            phase that was the same in all snapshots starts to turn); it is cast to the old dtype.
+            phase that was the same in all snapshots starts to turn); it is cast to the old dtype, whole numbers
+            becoming real ones.
         parameters: the effect's parameters.
         instance: which object, antenna, band or device; None where there is only one.
         kind: "mean" for parameters that shift the site's value; "variance" for a random field whose standard

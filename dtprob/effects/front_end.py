@@ -208,7 +208,7 @@ def iq_imbalance(sites: Sites, data: Data) -> list[Effect]:
 
 
 def _mirror(frequency: Float[Array, " n"]) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:
-    """Index of the subcarrier nearest to -f_k, and whether it lies within half a subcarrier of it."""
+    """Index of the subcarrier nearest to -f_k, and whether it lies within a quarter of a subcarrier of it."""
     distance = jnp.abs(frequency[:, None] + frequency[None, :])
     step = (jnp.max(frequency) - jnp.min(frequency)) / (frequency.shape[0] - 1)
     return jnp.argmin(distance, axis=1), jnp.min(distance, axis=1) < 0.25 * step

@@ -66,7 +66,7 @@ def catalogue(sites: Sites, data: Data, use: str | Iterable[str | Effect] = "all
             site that the model lacks, or two effects have one name.
     """
     if use == "all":
-        return _unique([effect for family in FAMILIES.values() for effect in family(sites, data)])
+        return _unique([effect for family in FAMILIES for effect in _offered(family, sites, data)])
     chosen: list[Effect] = []
     for entry in [use] if isinstance(use, str) else use:
         chosen += [_checked(entry, sites)] if isinstance(entry, Effect) else _named(entry, sites, data)
@@ -78,12 +78,26 @@ def summaries() -> dict[str, str]:
     return {name: (family.__doc__ or "").strip().splitlines()[0] for name, family in FAMILIES.items()}
 
 
+def _offered(family: str, sites: Sites, data: Data) -> list[Effect]:
+    """The instances of a family that find what they need by the time that the model computes their sites."""
+    return [effect for effect in FAMILIES[family](sites, data) if _finds_its_needs(effect, sites, data)]
+
+
+def _finds_its_needs(effect: Effect, sites: Sites, data: Data) -> bool:
+    order = list(sites)
+    return all(
+        need in data or need == site or need in order[: order.index(site)]
+        for site in effect.sites
+        for need in effect.requires
+    )
+
+
 def _named(name: str, sites: Sites, data: Data) -> list[Effect]:
     """All instances of a family, or the one instance of that name."""
     family = name.partition("[")[0]
     if family not in FAMILIES:
         raise unknown_name("effects", name, FAMILIES, "effect family")
-    offered = list(FAMILIES[family](sites, data))
+    offered = _offered(family, sites, data)
     found = offered if name == family else [effect for effect in offered if effect.name == name]
     if found:
         return found

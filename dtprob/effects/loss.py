@@ -19,7 +19,7 @@ from dtprob.effects.common import (
     half_normal,
     has_phase,
     legendre,
-    n_link,
+    links_and_paths,
     n_snapshot,
     normal,
     offers,
@@ -199,6 +199,10 @@ def phase_error(sites: Sites, _data: Data) -> list[Effect]:
 
 
 def _phase_error(instance: str | None, count: int, reason: str) -> Effect:
+    def shape(value: Any, context: Mapping[str, Any]) -> tuple[int, int, int]:
+        links, paths = links_and_paths(value, context)
+        return links, count, paths
+
     return Effect(
         "phase_error",
         {"path_phase": lambda value, p, _: value + p["scale"] * p[FIELD]},
@@ -207,7 +211,7 @@ def _phase_error(instance: str | None, count: int, reason: str) -> Effect:
         kind="variance",
         physics=f"Independent phase of every path, {reason}.",
         source="Ruah et al., arXiv 2312.12625, the von Mises error in its Gaussian limit.",
-        field_shape=lambda _, context: (n_link(context), count, context["path_gain"].shape[1]),
+        field_shape=shape,
     )
 
 

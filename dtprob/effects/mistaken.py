@@ -115,7 +115,7 @@ def bandwidth_mismatch(sites: Sites, data: Data) -> list[Effect]:
             physics="All subcarriers lie this share farther from the carrier than recorded; the carrier stays. Where each"
             " link has a time origin of its own, its first path stays too.",
             source="f_k' tau = f_k (1 + s) tau; the phase that the stretched delay gives the carrier is taken off.",
-            requires=("paths",),
+            requires=("paths", "path_delay"),
         )
     ]
 

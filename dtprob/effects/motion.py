@@ -22,7 +22,7 @@ from dtprob.effects.common import (
     half_normal,
     has_phase,
     is_coherent,
-    n_link,
+    links_and_paths,
     n_snapshot,
     normal,
     observable_basis,
@@ -147,7 +147,11 @@ def carrier_phase_drift(sites: Sites, data: Data) -> list[Effect]:
             physics="Phase common to all paths that does a random walk over the snapshots of a link.",
             source="Free-running oscillator: Demir et al., IEEE Trans. Circuits Syst. I 47 (2000).",
             requires=("snapshot_time",),
-            field_shape=lambda _, context: (n_link(context), np.shape(context["snapshot_time"])[0], 1),
+            field_shape=lambda value, context: (
+                links_and_paths(value, context)[0],
+                np.shape(context["snapshot_time"])[0],
+                1,
+            ),
         )
     ]
 
@@ -165,7 +169,7 @@ def phase_noise(sites: Sites, data: Data) -> list[Effect]:
             kind="variance",
             physics="Phase common to all paths, independent between snapshots and links.",
             source="Common phase error of OFDM: Petrovic et al., IEEE Trans. Commun. 55 (2007).",
-            field_shape=lambda _, context: (n_link(context), count, 1),
+            field_shape=lambda value, context: (links_and_paths(value, context)[0], count, 1),
         )
     ]
 

@@ -158,6 +158,7 @@ def noise_imbalance(sites: Sites, _data: Data) -> list[Effect]:
             kind="variance",
             physics="Log noise power that differs at random between links.",
             source="N exp(s z_link).",
+            requires=("noiseless_channel",),
             field_shape=lambda _, context: (context["noiseless_channel"].shape[0], 1, 1, 1, 1),
         )
     ]

@@ -46,10 +46,11 @@ class Rewriting(Changing):
         self._effects, self._parameters, self._data = tuple(effects), parameters, data
         self._seen: dict[str, Any] = {}
         self._fields: dict[str, jax.Array] = {}
+        self._drawn: dict[str, dist.Distribution] = {}
 
     def __enter__(self) -> Any:
         """Start a run: nothing seen, no field drawn."""
-        self._seen, self._fields = {}, {}
+        self._seen, self._fields, self._drawn = {}, {}, {}
         return super().__enter__()
 
     def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
@@ -57,6 +58,10 @@ class Rewriting(Changing):
         super().process_message(msg)
         if msg["type"] != "sample":
             return
+        if (
+            msg["name"] in self._drawn
+        ):  # a field counts once, whatever masks and scales the model has around the site
+            msg["fn"], msg["scale"] = self._drawn[msg["name"]], None
         context = Context(self._data, self._seen)
         for effect in self._effects:
             if msg["name"] in effect.distributions:
@@ -99,6 +104,7 @@ class Rewriting(Changing):
             # The field has its own shape, so the plates around the site must not expand it.
             plates = [frame.name for frame in msg["cond_indep_stack"]]
             name = effect.site_name(FIELD)
+            self._drawn[name] = normal
             drawn = numpyro.sample(name, normal, infer={"block_plates": plates})
             self._fields[effect.name] = jnp.asarray(drawn)
         return {**given, FIELD: self._fields[effect.name]}
@@ -145,7 +151,10 @@ def may_become(old: Sequence[int], new: Sequence[int]) -> bool:
 
 
 def _fit(effect: str, site: str, old: Any, new: Any) -> jax.Array:
-    """The new value in the old dtype, after a check that it can stand where the old one stood."""
+    """The new value in the old dtype, after a check that it can stand where the old one stood.
+
+    Real numbers in the place of whole ones stay real: cut off to whole ones, a small effect would be none.
+    """
     old, new = jnp.asarray(old), jnp.asarray(new)
     if not may_become(old.shape, new.shape):
         raise InputError(
@@ -161,7 +170,8 @@ def _fit(effect: str, site: str, old: Any, new: Any) -> jax.Array:
             str(new.dtype),
             "Return real values.",
         )
-    return new.astype(old.dtype)
+    whole = not jnp.issubdtype(old.dtype, jnp.inexact) and jnp.issubdtype(new.dtype, jnp.inexact)
+    return new.astype(jnp.result_type(old.dtype, float) if whole else old.dtype)
 
 
 def with_effects(model: Model, effects: Sequence[Effect]) -> Model:

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-_LEAST = 1e-30
-
 
 class ClustersLike(Protocol):
     """What effects look at in the clusters of a network."""
@@ -52,8 +50,20 @@ def mix(
         other: probabilities of the law that takes p's place.
         amount: 0 leaves p, infinity leaves `other`.
     """
-    p = jax.nn.softmax(logits)
-    return logits + jnp.log(jnp.exp(-amount) - jnp.expm1(-amount) * other / jnp.maximum(p, _LEAST))
+    amount, log_p = jnp.asarray(amount), jax.nn.log_softmax(logits)
+    is_there, is_mixed = other > 0, amount > 0
+    log_other = jnp.log(jnp.where(is_there, other, 1.0))
+    # In logs: unseen outcomes of a table may have a p far below the smallest number that can be divided by.
+    some = jnp.where(is_mixed, amount, 1.0)
+    log_mixed = jnp.logaddexp(log_p - some, log_other + jnp.log(-jnp.expm1(-some)))
+    total = jax.nn.logsumexp(logits, axis=-1, keepdims=True)
+    mixed = jnp.where(is_there, total + log_mixed, logits - some)
+    # The logarithm of q has no derivative at 0. This form has, and is exact there; the ratio's square is finite.
+    none = jnp.where(is_mixed, 0.0, amount)
+    most = np.log(float(jnp.finfo(log_p.dtype).max)) / 2 - 1.0
+    ratio = jnp.where(is_there, jnp.exp(jnp.minimum(log_other - log_p, most)), 0.0)
+    kept = logits + jnp.log(jnp.exp(-none) - jnp.expm1(-none) * ratio)
+    return jnp.where(is_mixed, mixed, kept)
 
 
 def tilted(
@@ -68,13 +78,14 @@ def tilted(
         bit: binary digit of the device in the number of an outcome.
         log_odds: logarithm of the factor, broadcasting to the batch.
     """
-    p = jax.nn.softmax(logits)
-    outcome = np.arange(p.shape[-1])
-    partner = p[..., outcome ^ bit]
-    up = jnp.exp(jnp.asarray(log_odds))[..., None]
-    own, other = jnp.where(outcome & bit, up, 1.0), jnp.where(outcome & bit, 1.0, up)
-    ratio = own * (p + partner) / jnp.maximum(own * p + other * partner, _LEAST)
-    return logits + jnp.log(jnp.where(p + partner > 0, ratio, 1.0))
+    outcome = np.arange(logits.shape[-1])
+    partner = logits[..., outcome ^ bit]
+    is_there = jnp.maximum(logits, partner) > -jnp.inf
+    here, there = (jnp.where(is_there, value, 0.0) for value in (logits, partner))
+    up = jnp.asarray(log_odds)[..., None]
+    own, other = jnp.where(outcome & bit, up, 0.0), jnp.where(outcome & bit, 0.0, up)
+    change = own + jnp.logaddexp(here, there) - jnp.logaddexp(own + here, other + there)
+    return logits + jnp.where(is_there, change, 0.0)
 
 
 def thinned(logits: Float[Array, "*batch outcome"], bit: int) -> Float[Array, "*batch outcome"]:
@@ -201,4 +212,11 @@ def from_then_on(amount: Any, windows: int, onset: Any) -> Float[Array, " window
     """
     place = (np.arange(windows) + 0.5) / windows
     after = (place - onset) * windows
-    return -jnp.logaddexp(jax.nn.log_sigmoid(-after), jax.nn.log_sigmoid(after) - amount)
+    # One form is exactly 0 at amount 0, the other keeps a large amount finite.
+    is_small = jnp.asarray(amount) < 1.0
+    small, large = jnp.where(is_small, amount, 0.0), jnp.where(is_small, 1.0, amount)
+    return jnp.where(
+        is_small,
+        -jnp.log1p(jax.nn.sigmoid(after) * jnp.expm1(-small)),
+        -jnp.logaddexp(jax.nn.log_sigmoid(-after), jax.nn.log_sigmoid(after) - large),
+    )

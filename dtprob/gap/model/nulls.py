@@ -24,7 +24,8 @@ def check_nulls(problem: Problem) -> None:
     """Look at each mean effect whose family the library lacks: at its null, sites have to stay what they are.
 
     Raises:
-        InputError: one changes a site there, or makes it infinite or not a number, or has no slope there.
+        InputError: one changes a site there, or makes it infinite or not a number, or has no slope there; or
+            a site is of whole numbers.
     """
     for effect in problem.effects:
         if effect.kind == "variance" and effect.distributions:
@@ -33,6 +34,7 @@ def check_nulls(problem: Problem) -> None:
             raise InputError(
                 f"effect {effect.name}", expected, got, "Let it rewrite a site that the model computes"
             )
+        _check_real(problem, effect)
     own = [e for e in problem.effects if e.kind == "mean" and e.family not in FAMILIES]
     if not own:
         return
@@ -56,6 +58,16 @@ def check_nulls(problem: Problem) -> None:
         for site in effect.distributions:
             _check_density(effect, site, observed[site], problem.observed.values[site], context)
         _check_slope(effect, values, context)
+
+
+def _check_real(problem: Problem, effect: Effect) -> None:
+    """What is of whole numbers has no gradient, and so no effect on it has a score."""
+    for site in effect.rewrites:
+        declared = problem.declaration.sites[site]
+        if declared.kind == "deterministic" and declared.size and site not in problem.float_sites:
+            got = "whole numbers, or true and false"
+            remedy = "Make it real in the model or in the data, as by x.astype(float)"
+            raise InputError(f"effect {effect.name}", f"real numbers at site {site!r}", got, remedy)
 
 
 def _check_density(

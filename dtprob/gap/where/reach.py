@@ -109,7 +109,7 @@ def reached(along: Mapping[str, Told], unordered: str | None, sizes: int) -> tup
     """Blocks of every axis that hold what mean effects close, family-wise at 1%; none of an axis they fill.
 
     Each block is told on its own as far as that goes (Holm 1979). The others of an axis, too weak alone, are told together:
-    as one finding of several parts where what they hold in sum is no chance.
+    as one finding of several parts where what they hold in sum is no chance. Where both can be, each has half the level.
 
     Args:
         along: what each position tells, by axis.
@@ -122,16 +122,18 @@ def reached(along: Mapping[str, Told], unordered: str | None, sizes: int) -> tup
         for low, high in _held(np.where(here.touched, here.energy, 0.0), together=axis != unordered)
     ]
     blocks.sort(key=lambda block: -block.z)
+    several = len(blocks) > len({block.axis for block in blocks})  # along one axis
+    level = LEVEL / 2 if several else LEVEL
     step_down = np.maximum.accumulate(
         [_chance(block.z, sizes) * (len(blocks) - k) for k, block in enumerate(blocks)]
     )
-    found = [block.found(float(p)) for block, p in zip(blocks, step_down, strict=True) if p < LEVEL]
+    found = [block.found(float(p)) for block, p in zip(blocks, step_down, strict=True) if p < level]
     weak = blocks[len(found) :]
     for axis in along:
         rest = sorted((block for block in weak if block.axis == axis), key=lambda block: block.low)
         if len(rest) > 1:
             all_of_them = _together(rest)
-            if (p := _chance(all_of_them.z, sizes) * len(along)) < LEVEL:
+            if (p := _chance(all_of_them.z, sizes) * len(along)) < level:
                 parts = tuple((block.low, block.high) for block in rest)
                 found.append(replace(all_of_them.found(p), parts=parts))
     return tuple(sorted(found, key=lambda b: -b.excess))

@@ -161,23 +161,6 @@ def test_nesting_makes_no_difference(order, cuts):
         assert not np.allclose(one, other)  # else the test could not fail
 
 
-@pytest.mark.parametrize(
-    ("prior", "null", "expected"),
-    [
-        (dist.HalfNormal(1.0), 0.0, True),
-        (dist.Normal(0.0, 1.0), 0.0, False),
-        (dist.HalfNormal(1.0).expand((3,)).to_event(1), 0.0, True),
-        (dist.Uniform(0.0, 1.0), 0.0, True),
-        (dist.Uniform(0.0, 1.0), 0.5, False),
-        (dist.LogNormal(0.0, 1.0), 1.0, False),
-        (dist.Beta(1.0, 5.0), 0.0, True),
-        (dist.TruncatedNormal(0.0, 1.0, low=0.0), 0.0, True),
-    ],
-)
-def test_one_sided(prior, null, expected):
-    assert Parameter("p", prior, null).is_one_sided is expected
-
-
 def test_values_that_a_site_cannot_take():
     def rewriting(rewrite):
         effect = Effect("wrong", {"mean": rewrite}, (Parameter("p", dist.Normal(0.0, 1.0)),))
@@ -198,6 +181,16 @@ def test_dtype_stays_that_of_the_site():
     assert value.dtype == jnp.float32
 
 
+@pytest.mark.parametrize("values", [jnp.arange(6), jnp.arange(6) > 2], ids=["whole", "boolean"])
+def test_a_site_of_whole_numbers_takes_real_ones(values):
+    with Rewriting(None, [BEND], {"bend": {"curvature": 0.1}}, DATA):
+        value = numpyro.deterministic("mean", values)
+    np.testing.assert_allclose(value, values + 0.1 * DATA["x"] ** 2)
+    up = Effect("up", {"mean": lambda value, p, _: value + 2}, BEND.parameters)
+    with Rewriting(None, [up], {"up": {"curvature": 0.1}}, DATA):
+        assert numpyro.deterministic("mean", jnp.arange(6)).dtype == jnp.arange(6).dtype
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -210,13 +203,6 @@ def test_dtype_stays_that_of_the_site():
 def test_incomplete_declarations_are_refused(changes, message):
     with pytest.raises(InputError, match=message):
         Effect(**{**vars(BEND), **changes})
-
-
-def test_labels_are_one_for_each_entry():
-    prior = dist.Normal(0.0, 1.0).expand([2]).to_event(1)
-    assert Parameter("gain", prior, labels=("left", "right")).labels == ("left", "right")
-    with pytest.raises(InputError, match="labels of parameter gain: expected 2, one for each entry, got 3"):
-        Parameter("gain", prior, labels=("x", "y", "z"))
 
 
 def test_context_prefers_sites_to_data():

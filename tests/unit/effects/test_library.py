@@ -1,13 +1,15 @@
 """Which effects are offered for which model and data, and how they are chosen."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.effects import FAMILIES, Effect, Parameter, catalogue, meaning, summaries
+from dtprob.effects import FAMILIES, Context, Effect, Parameter, catalogue, meaning, summaries, with_effects
 from dtprob.errors import InputError
+from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import Site, declare, model
 from dtprob.models.scene import AXES
 
@@ -176,3 +178,80 @@ def test_a_family_that_the_data_do_not_allow(build_world):
     world = build_world(snapshot_time=None)
     with pytest.raises(InputError, match="no doppler"):
         catalogue(world.sites, world.data, ["doppler"])
+
+
+def in_order(first, *late):
+    """The sites, some of which the model computes after all others."""
+    return {n: s for n, s in first.items() if n not in late} | {n: first[n] for n in late}
+
+
+@pytest.mark.parametrize(
+    ("late", "families"),
+    [
+        (("noiseless_channel",), {"quantization", "error_vector_magnitude"}),
+        (("path_delay",), {"bandwidth_mismatch"}),
+        (("frequency_response",), {"extra_path", "diffuse_scattering"}),
+    ],
+)
+def test_what_an_effect_looks_at_comes_before_what_it_rewrites(world, late, families):
+    offered = {effect.family for effect in catalogue(in_order(world.sites, *late), world.data)}
+    assert families <= {effect.family for effect in catalogue(world.sites, world.data)}
+    assert not families & offered
+    with pytest.raises(InputError, match="an effect that this model and data allow"):
+        catalogue(in_order(world.sites, *late), world.data, min(families))
+
+
+def test_what_effects_look_at_is_said(world):
+    """Every site that a rewrite looks up is among what the effect says that it requires, or can be done without."""
+    trace = numpyro.handlers.trace(numpyro.handlers.seed(world.model, 0)).get_trace(**world.data)
+    values, looked_at = {n: m["value"] for n, m in trace.items() if n in world.sites}, set()
+
+    class Watched(Context):
+        def __getitem__(self, name):
+            looked_at.add(name)
+            return super().__getitem__(name)
+
+    for effect in catalogue(world.sites, world.data):
+        looked_at.clear()
+        jax.eval_shape(lambda effect=effect: every_rewrite(effect, values, Watched(world.data, values)))
+        optional = {"thickness", "path_gain", "receiver_gain", "receiver_delay"}
+        assert looked_at & values.keys() <= {*effect.requires, *optional}, effect.name
+
+
+def every_rewrite(effect, values, context):
+    """The rewritten sites at the null."""
+    parameters = effect.null()
+    if effect.kind == "variance":
+        shape = effect.field_shape or (lambda value, _: value.shape)
+        parameters["field"] = jnp.zeros(shape(values[effect.sites[0]], context))
+    return [rewrite(values[site], parameters, context) for site, rewrite in effect.rewrites.items()]
+
+
+PHASES = ("phase_error", "phase_noise", "carrier_phase_drift")
+
+
+def test_effects_on_phases_need_no_gains(world):
+    """A model may turn the paths of a traced channel without a site for their gains."""
+
+    @model(axes={**AXES, "channel": AXES["noiseless_channel"]}, cluster="link")
+    def turned(paths, channel=None):
+        phase = numpyro.deterministic("path_phase", jnp.zeros((3, 1, 7)))
+        turns = jnp.exp(1j * phase)[:, :, None, None]
+        gains = jnp.asarray(paths.mask, float)
+        summed = jnp.einsum("lsrtp,lp->lsrt", turns, gains)[..., None] * jnp.ones(17)
+        noiseless = numpyro.deterministic("noiseless_channel", summed)
+        with numpyro.plate("link", 3, dim=-5):
+            numpyro.sample("channel", ComplexNormal(noiseless, 1.0), obs=channel)
+
+    def run(snapshot_time, **data):
+        return turned(**data)
+
+    data = {"paths": world.data["paths"], "channel": jnp.ones((3, 8, 1, 1, 17), complex)}
+    sites = declare(turned, data).sites
+    timed = {**data, "snapshot_time": world.data["snapshot_time"]}
+    for effect in catalogue(sites, timed, PHASES):
+        trace = numpyro.handlers.trace(numpyro.handlers.seed(with_effects(run, [effect]), 0)).get_trace(
+            **timed
+        )
+        snapshots = 1 if effect.name == "phase_error" else 8
+        assert trace["path_phase"]["value"].shape == (3, snapshots, 7)

@@ -4,10 +4,12 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.effects.effect import Effect, Parameter
+from dtprob.effects import Effect, Parameter, catalogue
 from dtprob.errors import InputError
 from dtprob.gap.model.nulls import check_nulls
 from dtprob.gap.model.problem import Problem
+from dtprob.models.declaration import declare
+from dtprob.models.label_twin import label_twin
 from tests.unit.gap.examples import bend, bump, draw, gusty, line
 
 
@@ -79,6 +81,21 @@ def test_an_effect_without_a_slope_at_its_null_is_refused(rewrite, message):
 def test_an_effect_that_acts_on_none_of_the_data_passes():
     nothing = Effect("far", {"mean": lambda v, p, c: v + 0.0 * p["by"]}, (Parameter("by", dist.Normal()),))
     check_nulls(Problem(line, draw("line"), [nothing]))
+
+
+@pytest.mark.parametrize("by_name", ["regional_bias[everywhere]", None], ids=["library", "own"])
+def test_effects_on_whole_numbers_are_refused(by_name):
+    """They have no gradient: a gap of three at every row was not seen at all."""
+    rng = np.random.default_rng(0)
+    prediction = rng.integers(0, 20, 60)
+    data = {"x": rng.uniform(size=(60, 1)), "prediction": prediction, "y": prediction + rng.normal(size=60)}
+    lifted = Effect(
+        "lifted", {"predicted_label": lambda v, p, c: v + p["by"]}, (Parameter("by", dist.Normal()),)
+    )
+    effects = catalogue(declare(label_twin, data).sites, data, [by_name or lifted])
+    with pytest.raises(InputError, match=r"expected real numbers at site 'predicted_label', got whole"):
+        check_nulls(Problem(label_twin, data, effects))
+    check_nulls(Problem(label_twin, {**data, "prediction": prediction.astype(float)}, effects))
 
 
 def test_two_effects_of_one_name_are_refused():
