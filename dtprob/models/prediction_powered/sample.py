@@ -203,10 +203,11 @@ class Sample:
             size = here.stop - start
             x = np.zeros((size, 0)) if self.x_unlabelled is None else np.asarray(self.x_unlabelled[here])
             given = self.prediction_unlabelled
-            prediction = np.asarray(given(x) if callable(given) else given[here])
+            told = np.asarray(given(x) if callable(given) else given[here])
+            prediction = _real("prediction_unlabelled", told)
             weight, context = self.weight_unlabelled, self.context_unlabelled
             yield Chunk(
-                x,
+                _real("x_unlabelled", x),
                 prediction.reshape(_prediction_shape(prediction.shape, size, self.y.shape[1:])),
                 ones[:size] if weight is None else weight[here],
                 zeros[:size] if context is None else context[here],
@@ -248,10 +249,15 @@ def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]
     raise InputError("prediction_unlabelled", expected, str(shape), "Give a prediction per unlabelled sample")
 
 
-def _finite(name: str, array: np.ndarray) -> np.ndarray:
+def _real(name: str, array: np.ndarray) -> np.ndarray:
+    """As numbers with a fraction, so that a mean of whole numbers or of yes and no is right."""
     if array.dtype.kind not in "fiub":
         raise InputError(name, "real numbers", f"values of type {array.dtype}", f"Give {name} as numbers")
-    array = array.astype(np.result_type(array.dtype, np.float32), copy=False)
+    return array.astype(np.result_type(array.dtype, np.float32), copy=False)
+
+
+def _finite(name: str, array: np.ndarray) -> np.ndarray:
+    array = _real(name, array)
     bad = ~np.isfinite(array)
     if bad.any():
         place = tuple(int(i) for i in np.argwhere(bad)[0])
