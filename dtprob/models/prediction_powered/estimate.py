@@ -90,7 +90,7 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         evaluation = problem.at(theta)
         inverse = inverse if problem.is_translation else problem.inverse(evaluation, lam)
     found = spread(evaluation, problem.mixes(lam.value), inverse, practice)
-    alone = spread(evaluation, problem.mixes(0 * lam.value), inverse, practice)
+    alone = spread(evaluation, problem.labels_alone(lam), inverse, practice)
     covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
     chance = (1 + level) / 2
     is_normal = practice.reference == "normal"
@@ -181,6 +181,10 @@ class _Problem:
 
     def mixes(self, lam: Float[Values, "*parameter context"]) -> Mix:
         return self.scheme.mix(self.start.n, self.start.n_unlabelled, lam)
+
+    def labels_alone(self, lam: Lambda) -> Mix:
+        """The weights without predictions, which a pooled scheme has at no lambda."""
+        return named_scheme("erm").mix(self.start.n, self.start.n_unlabelled, 0 * lam.value)
 
     def inverse(self, evaluation: Evaluation, lam: Lambda) -> Float[Values, "parameter parameter"]:
         return inverse_hessian(self.loss, evaluation, self.mixes(lam.value.mean(axis=0)))

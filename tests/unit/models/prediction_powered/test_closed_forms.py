@@ -59,6 +59,13 @@ def test_variance_is_its_formula():
         assert estimate("mean", sample, scheme).covariance[0, 0] == pytest.approx(variance, rel=1e-12)
 
 
+@pytest.mark.parametrize("scheme", ["erm", "ss", "ppi", "tuned_ppi", "cppi", "tuned_cppi"])
+def test_labels_alone_have_their_own_variance_under_every_scheme(scheme):
+    sample = scalar()
+    found = estimate("mean", sample, scheme)
+    assert found.labels_only_variance == pytest.approx([sample.y.var(ddof=1) / sample.n], rel=1e-12)
+
+
 @pytest.mark.parametrize("lam", [0.0, 0.4, 1.0])
 def test_a_given_lambda_is_used(lam):
     sample = scalar()
