@@ -217,7 +217,7 @@ def _quantile_draws(
 ) -> Float[np.ndarray, "draw parameter"]:
     """Woodruff's way: the distribution function is resampled at the estimate and inverted around it."""
     problem = quantile_problem(loss, sample, estimate.scheme)
-    true, unlabelled, predicted = problem.mix(estimate.lam)
+    mix = true, unlabelled, predicted = problem.mix(estimate.lam)
     theta = float(estimate.theta[0])
     prediction = sample.y if sample.prediction is None else sample.prediction
     step = true * (sample.y <= theta) - predicted * (prediction <= theta)
@@ -226,15 +226,4 @@ def _quantile_draws(
     variance = problem.unlabelled_variance(theta)
     noise = random.standard_normal(draws) * np.sqrt(variance)
     shift = labelled - sample.labelled_weight @ step / sample.n + unlabelled * noise
-    function = problem.steps.function(true, unlabelled, predicted)
-    start = function[np.searchsorted(problem.steps.value, theta)]
-    return _inverse(problem.steps.value, np.maximum.accumulate(function), start - shift)[:, None]
-
-
-def _inverse(
-    value: Float[np.ndarray, " value"],
-    function: Float[np.ndarray, " value"],
-    level: Float[np.ndarray, " draw"],
-) -> Float[np.ndarray, " draw"]:
-    index = np.searchsorted(function, level - 1e-12)
-    return value[np.minimum(index, len(value) - 1)]
+    return problem.minimisers(mix, loss.level - shift)[:, None]

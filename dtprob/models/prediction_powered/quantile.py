@@ -1,18 +1,19 @@
 """Quantiles: their loss has no second derivative, but their estimate and interval need only sorting.
 
-The corrected distribution function is F = F_Y + lambda (F~_f - F_f); the estimate is the value at which F is
-nearest the level, and the interval holds all values that a test at that level does not reject.
+The corrected distribution function is F = F_Y + lambda (F~_f - F_f); the corrected check loss is the integral
+of F less the level. The estimate is its minimiser, and the interval holds all values that a test at that level
+does not reject.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import NamedTuple, final
+from typing import Any, NamedTuple, final
 
 import jax
 import numpy as np
-from jaxtyping import Float
-from scipy import stats
+from jaxtyping import Float, Int
+from scipy import optimize, stats
 
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.moments import Evaluation, Group
@@ -91,10 +92,10 @@ def estimate_quantile(
     problem = quantile_problem(loss, sample, scheme)
     start = practice.pilot if scheme.lam is None else scheme.lam
     lam = fixed(start, problem.evaluation(0.0))
-    theta = problem.nearest(lam)
+    theta = problem.minimiser(lam)
     for _ in range(practice.rounds if scheme.is_tuned else 0):
         lam = tune(problem.evaluation(theta), np.ones((1, 1)), "overall", practice)
-        theta = problem.nearest(lam)
+        theta = problem.minimiser(lam)
     return problem.result(theta, lam, level)
 
 
@@ -174,13 +175,24 @@ class QuantileProblem:
         mix = self.scheme.mix(n, count, lam.value[0])
         return float(mix.true), float(mix.unlabelled[0]), float(mix.predicted[0])
 
-    def nearest(self, lam: Lambda) -> float:
-        """The least value at which the mixed distribution function is nearest the level.
+    def minimiser(self, lam: Lambda) -> float:
+        """The least minimiser of the corrected check loss."""
+        return float(self.minimisers(self.mix(lam), np.array([self.loss.level]))[0])
 
-        Distances are rounded, so that among values equally near the choice is not left to rounding errors.
+    def minimisers(
+        self, mix: tuple[float, float, float], level: Float[np.ndarray, " level"]
+    ) -> Float[np.ndarray, " level"]:
+        """Those for several levels.
+
+        The corrected function may fall, so that it passes a level more than once. Made to rise by isotonic
+        regression, in which a value counts by the gap to the next, it has the same minimiser. Levels are
+        lowered by a rounding error, so that a flat piece of the loss ends where it begins.
         """
-        distance = np.abs(self.steps.function(*self.mix(lam)) - self.loss.level)
-        return float(self.steps.value[np.argmin(np.round(distance, 12))])
+        value, function = self.steps.value, self.steps.function(*mix)
+        if len(value) == 1:
+            return np.full(level.shape, value[0])
+        rising: Any = optimize.isotonic_regression(function[:-1], weights=np.diff(value))
+        return value[np.searchsorted(rising.x, level - 1e-12)]
 
     def variance(self, steps: Steps, mix: tuple[float, float, float]) -> Float[np.ndarray, " value"]:
         """Variance of the mixed distribution function at each value."""
@@ -196,12 +208,17 @@ class QuantileProblem:
         there = self.steps.at(theta)
         return float(self.variance(there, (0.0, 1.0, 0.0))[0])
 
+    def _ends(self, inside: Int[np.ndarray, " inside"]) -> tuple[float, float]:
+        """The ends of steps that are not rejected, each of which goes on up to the next value."""
+        value = self.steps.value
+        return float(value[inside[0]]), float(value[min(inside[-1] + 1, len(value) - 1)])
+
     def result(self, theta: float, lam: Lambda, level: float) -> Estimate:
         """The estimate with the interval of all values that are not rejected."""
         mix, z = self.mix(lam), stats.norm.ppf((1 + level) / 2)
         deviation = np.abs(self.steps.function(*mix) - self.loss.level)
-        inside = self.steps.value[deviation < z * np.sqrt(self.variance(self.steps, mix))]
-        low, high = (inside[0], inside[-1]) if len(inside) else (theta, theta)
+        inside = np.flatnonzero(deviation < z * np.sqrt(self.variance(self.steps, mix)))
+        low, high = self._ends(inside) if len(inside) else (theta, theta)
         variance = ((high - low) / (2 * z)) ** 2
         there = self.steps.at(theta)
         own, alone = self.variance(there, mix)[0], self.variance(there, (1.0, 0.0, 0.0))[0]
