@@ -21,7 +21,7 @@ type Predictor = Callable[[np.ndarray], np.ndarray]
 
 
 class Chunk(NamedTuple):
-    """Consecutive unlabelled samples; rows added to fill a chunk have weight 0."""
+    """Consecutive unlabelled samples; a chunk is filled with copies of its last row, of weight 0."""
 
     x: Float[Values, "sample feature"]
     prediction: Float[Values, "sample fold ..."]
@@ -229,14 +229,15 @@ def _averaged(chunk: Chunk) -> Chunk:
 
 
 def _filled(chunk: Chunk, size: int) -> Chunk:
-    """JAX's arrays of `size` rows."""
+    """JAX's arrays of `size` rows; a loss need not be finite but where there are samples, so the last is repeated."""
     short = size - len(chunk.weight)
 
     def filled(array: Values) -> Array:
         whole = jnp.asarray(array)
-        return jnp.pad(whole, [(0, short), *[(0, 0)] * (whole.ndim - 1)]) if short else whole
+        return jnp.concatenate([whole, jnp.repeat(whole[-1:], short, axis=0)]) if short else whole
 
-    return Chunk(*(filled(part) for part in chunk))
+    weight = jnp.pad(jnp.asarray(chunk.weight), (0, short))
+    return Chunk(*(filled(part) for part in chunk))._replace(weight=weight)
 
 
 def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]) -> tuple[int, ...]:

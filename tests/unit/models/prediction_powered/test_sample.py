@@ -1,10 +1,12 @@
 """What a sample makes of the arrays that it is given."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.estimate import estimate
+from dtprob.models.prediction_powered.losses import CustomLoss
 from dtprob.models.prediction_powered.quantile import Quantile
 from dtprob.models.prediction_powered.sample import Sample
 
@@ -45,3 +47,13 @@ def test_predictions_that_are_no_numbers_are_refused():
     sample = Sample(y=np.arange(3.0), prediction=np.arange(3.0), prediction_unlabelled=np.array(["a", "b"]))
     with pytest.raises(InputError, match="prediction_unlabelled: expected real numbers"):
         estimate("mean", sample, "cppi")
+
+
+def test_what_fills_a_chunk_is_within_the_domain_of_the_loss():
+    y = np.random.default_rng(5).lognormal(size=120)
+    fields = {"y": y[:20], "prediction": 0.9 * y[:20], "prediction_unlabelled": 0.9 * y[20:]}
+    loss = CustomLoss(lambda theta, x, y: 0.5 * (theta[0] - jnp.log(y)) ** 2, jnp.zeros(1))
+    whole, chunked = (estimate(loss, Sample(**fields, chunk=chunk), "cppi") for chunk in (None, 64))
+    np.testing.assert_allclose(chunked.theta, whole.theta, rtol=1e-10)
+    np.testing.assert_allclose(chunked.covariance, whole.covariance, rtol=1e-10)
+    np.testing.assert_allclose(whole.theta, np.log(y[20:]).mean(), rtol=1e-10)  # the factor .9 cancels
