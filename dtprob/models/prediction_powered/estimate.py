@@ -45,9 +45,10 @@ def estimate(
             the labels, for "cppi" and "tuned_cppi" from K predictors trained without one fold each.
         scheme: "erm", "ss", "ppi", "tuned_ppi", "cppi" or "tuned_cppi".
         lam: weight of the correction, from 0 to 1, instead of the scheme's.
-        by: with a tuned scheme, one lambda overall, per parameter or per context.
+        by: with a tuned scheme, one lambda overall, per parameter or per context (not for a
+            quantile).
         level: of the intervals.
-        practice: conventions for finite samples.
+        practice: conventions for finite samples; for a quantile only those of lambda.
 
     Raises:
         InputError: an unknown name, a level or lambda out of range, data on which the loss has no minimiser.
@@ -56,10 +57,10 @@ def estimate(
     notes: tuple[str, ...] = ()
     if not sample.has_predictions and chosen.name != "erm":
         chosen, notes = named_scheme("erm"), (NO_UNLABELLED,)
+    _check_contexts(by, loss, sample, practice)
     if isinstance(loss, Quantile):
         result = estimate_quantile(loss, sample, chosen, level=level, practice=practice)
     else:
-        _check_contexts(by, sample, practice)
         result = _estimate(_problem(named_loss(loss), sample, chosen, practice), by, level)
     return replace(result, notes=(*notes, *result.notes))
 
@@ -113,9 +114,11 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
     )
 
 
-def _check_contexts(by: By, sample: Sample, practice: Practice) -> None:
+def _check_contexts(by: By, loss: str | AbstractLoss | Quantile, sample: Sample, practice: Practice) -> None:
     if by not in get_args(By.__value__):
         raise unknown_name("by", by, get_args(By.__value__), "choice")
+    if by == "context" and isinstance(loss, Quantile):
+        raise InputError("by", "overall, for a quantile", "'context'", "Leave it out, or use SmoothQuantile")
     if by == "context" and practice.form == "estimates":
         remedy = "Use form loss, or tune overall"
         raise InputError("practice", "form loss, to tune by context", "form estimates", remedy)

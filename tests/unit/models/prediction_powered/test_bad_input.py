@@ -61,6 +61,14 @@ CALLS = {
     ),
     "quantile level": (lambda: Quantile(1.0), "quantile: expected a level between 0 and 1"),
     "quantile of vectors": (lambda: estimate(Quantile(0.5), Sample(y=X), "erm"), "y: expected labels of one"),
+    "by nothing that there is": (
+        lambda: estimate(Quantile(0.5), scalar(), by="nonsense"),
+        "by: expected one of the choices context, overall, parameter, got 'nonsense'",
+    ),
+    "quantile by context": (
+        lambda: estimate(Quantile(0.5), scalar(), by="context"),
+        "by: expected overall, for a quantile, got 'context'",
+    ),
     "posterior of a quantile": (
         lambda: posterior_data(Quantile(0.5), scalar(), estimate(Quantile(0.5), scalar())),
         "loss: expected one with a second derivative",
