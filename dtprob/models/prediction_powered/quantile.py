@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 from scipy import optimize, stats
 
 from dtprob.errors import InputError
+from dtprob.models.prediction_powered.losses import check_scalar
 from dtprob.models.prediction_powered.moments import Evaluation, Group
 from dtprob.models.prediction_powered.result import Estimate
 from dtprob.models.prediction_powered.sample import Sample
@@ -86,9 +87,7 @@ def estimate_quantile(
     Raises:
         InputError: labels with more than one entry.
     """
-    if sample.y.ndim != 1:
-        got = f"shape {sample.y.shape}"
-        raise InputError("y", "labels of one number, for a quantile", got, "Take one entry at a time")
+    check_scalar(sample.y, "a quantile")
     problem = quantile_problem(loss, sample, scheme)
     start = practice.pilot if scheme.lam is None else scheme.lam
     lam = fixed(start, problem.evaluation(0.0))
