@@ -101,13 +101,9 @@ def estimate_quantile(
 def _steps(sample: Sample) -> Steps:
     weight, y = sample.labelled_weight, sample.y
     prediction = y if sample.prediction is None else sample.prediction
-    chunks = [
-        (np.asarray(chunk.prediction), np.asarray(chunk.weight))
-        for chunk in (sample.chunks() if sample.has_predictions else ())
-    ]
-    unlabelled = np.concatenate([p for p, _ in chunks]) if chunks else np.zeros((0, 1))
-    weights = np.concatenate([w for _, w in chunks]) if chunks else np.zeros(0)
-    unlabelled, weights = unlabelled[weights > 0], weights[weights > 0]
+    blocks = list(sample.blocks()) if sample.has_predictions else []
+    unlabelled = np.concatenate([block.prediction for block in blocks]) if blocks else np.zeros((0, 1))
+    weights = np.concatenate([block.weight for block in blocks]) if blocks else np.zeros(0)
     folds, count = unlabelled.shape[1], max(sample.n_unlabelled, 1)
     ordered = np.sort(unlabelled, axis=1)
     rank = (2 * np.arange(folds) + 1) / folds**2

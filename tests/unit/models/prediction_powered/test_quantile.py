@@ -66,6 +66,19 @@ def test_no_value_has_a_smaller_corrected_loss(scheme, level, change):
     assert corrected_loss(found.theta, level, sample, mix)[0] == pytest.approx(loss.min(), abs=1e-12)
 
 
+def test_predictions_keep_their_precision():
+    sample = scalar(n=41)
+    moved = Sample(
+        y=sample.y + 1e9,
+        prediction=sample.prediction + 1e9,
+        prediction_unlabelled=sample.prediction_unlabelled + 1e9,
+    )
+    with jax.enable_x64(False):
+        found, there = (estimate(Quantile(0.5), one) for one in (sample, moved))
+    for name in ("theta", "low", "high"):
+        np.testing.assert_allclose(getattr(there, name) - 1e9, getattr(found, name), atol=1e-5)
+
+
 def test_the_interval_ends_where_rejection_begins():
     # k of 20 labels at or below theta reject the median unless 7 <= k <= 13, and there are 13 up to the 14th.
     found = estimate(Quantile(0.5), Sample(y=np.arange(1.0, 21.0)), "erm")
