@@ -55,7 +55,8 @@ class Steps(NamedTuple):
         both: of the greater of the two.
         unlabelled: of the predictions of unlabelled samples, all predictors together.
         square: mean square over unlabelled samples of the share of predictors at or below the value.
-        square_true, square_predicted: like true and predicted, with squared weights.
+        square_true, square_predicted, square_unlabelled: like true, predicted and unlabelled, with squared
+            weights.
     """
 
     value: Float[np.ndarray, " value"]
@@ -66,6 +67,7 @@ class Steps(NamedTuple):
     square: Float[np.ndarray, " value"]
     square_true: Float[np.ndarray, " value"]
     square_predicted: Float[np.ndarray, " value"]
+    square_unlabelled: Float[np.ndarray, " value"]
 
     def function(self, true: float, unlabelled: float, predicted: float) -> Float[np.ndarray, " value"]:
         """The mixed distribution function."""
@@ -123,12 +125,23 @@ def _steps(sample: Sample) -> Steps:
         square=function(ordered, weights[:, None] ** 2 * rank / count),
         square_true=function(y, weight**2 / n),
         square_predicted=function(prediction, weight**2 / n),
+        square_unlabelled=function(ordered, np.repeat(weights[:, None] ** 2, folds, 1) / (folds * count)),
     )
 
 
 def quantile_problem(loss: Quantile, sample: Sample, scheme: Scheme) -> QuantileProblem:
     """A quantile's data, sorted."""
     return QuantileProblem(loss, sample, scheme, _steps(sample))
+
+
+def _about_mean(
+    mean: Float[np.ndarray, " value"],
+    second: Float[np.ndarray, " value"],
+    twice: Float[np.ndarray, " value"],
+    square: Float[np.ndarray, "1"],
+) -> Float[np.ndarray, " value"]:
+    """Mean square of weight (x - mean), from the means of weight x, (weight x)^2, weight^2 x and weight^2."""
+    return np.maximum(second - mean * (2 * twice - square * mean), 0.0)
 
 
 @final
@@ -143,25 +156,29 @@ class QuantileProblem:
 
     def evaluation(self, theta: float) -> Evaluation:
         """The gradients of the check loss at theta, in the form that tuning takes."""
-        sample, level, there = self.sample, self.loss.level, self.steps.at(theta)
+        sample, level, there, end = self.sample, self.loss.level, self.steps.at(theta), self.steps.at(np.inf)
         prediction = sample.y if sample.prediction is None else sample.prediction
 
         def gradient(values: np.ndarray) -> np.ndarray:
             return (sample.labelled_weight * ((values <= theta) - level))[:, None]
 
-        mean = there.unlabelled[0] - level
-        second = there.square[0] - 2 * level * there.unlabelled[0] + level**2
+        mean = there.unlabelled - level * end.unlabelled
+        twice = there.square_unlabelled - level * end.square_unlabelled
+        second = there.square - level * (there.square_unlabelled + twice)
         one = np.ones((1, 1, 1))
         nothing = Group(np.zeros(1), np.zeros((1, 1)), one, one)
         return Evaluation(
             labelled=nothing,
             predicted=nothing,
-            unlabelled=Group(np.zeros(1), np.full((1, 1), mean), one, np.full((1, 1, 1), second)),
+            unlabelled=Group(
+                np.zeros(1), mean[None], one, second[None, None], twice[None], end.square_unlabelled
+            ),
             gradient=gradient(sample.y),
             predicted_gradient=gradient(prediction),
             context=np.zeros(sample.n, int),
             n=np.asarray(float(sample.n)),
             n_unlabelled=np.asarray(float(max(sample.n_unlabelled, 1))),
+            weight=sample.labelled_weight,
         )
 
     def mix(self, lam: Lambda) -> tuple[float, float, float]:
@@ -192,10 +209,17 @@ class QuantileProblem:
     def variance(self, steps: Steps, mix: tuple[float, float, float]) -> Float[np.ndarray, " value"]:
         """Variance of the mixed distribution function at each value."""
         true, unlabelled, predicted = mix
-        mean = true * steps.true - predicted * steps.predicted
+        end = self.steps.at(np.inf)
         square = true**2 * steps.square_true + predicted**2 * steps.square_predicted
-        labelled = np.maximum(square - 2 * true * predicted * steps.both - mean**2, 0.0)
-        rest = unlabelled**2 * np.maximum(steps.square - steps.unlabelled**2, 0.0)
+        labelled = _about_mean(
+            true * steps.true - predicted * steps.predicted,
+            square - 2 * true * predicted * steps.both,
+            true * steps.square_true - predicted * steps.square_predicted,
+            end.square_true,
+        )
+        rest = unlabelled**2 * _about_mean(
+            steps.unlabelled, steps.square, steps.square_unlabelled, end.square_unlabelled
+        )
         return labelled / self.sample.n + rest / max(self.sample.n_unlabelled, 1)
 
     def unlabelled_variance(self, theta: float) -> float:
