@@ -57,12 +57,14 @@ def estimate(
     notes: tuple[str, ...] = ()
     if not sample.has_predictions and chosen.name != "erm":
         chosen, notes = named_scheme("erm"), (NO_UNLABELLED,)
+    elif chosen.pooled:
+        notes = (BIASED,)
     _check_contexts(by, loss, sample, practice)
     if isinstance(loss, Quantile):
         result = estimate_quantile(loss, sample, chosen, level=level, practice=practice)
     else:
         result = _estimate(_problem(named_loss(loss), sample, chosen, practice), by, level)
-    return replace(result, notes=(*notes, *result.notes))
+    return replace(result, notes=notes)
 
 
 def _checked(scheme: Scheme, lam: float | None, level: float) -> Scheme:
@@ -110,7 +112,6 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         scheme=problem.scheme,
         n=sample.n,
         n_unlabelled=sample.n_unlabelled if sample.has_predictions else 0,
-        notes=(BIASED,) if problem.scheme.pooled else (),
     )
 
 

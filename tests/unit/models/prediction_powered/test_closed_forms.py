@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dtprob.models.prediction_powered.estimate import BIASED, NO_UNLABELLED, estimate
+from dtprob.models.prediction_powered.quantile import Quantile
 from dtprob.models.prediction_powered.sample import Sample
 from dtprob.models.prediction_powered.tuning import Practice
 from tests.unit.models.prediction_powered.examples import linear, scalar
@@ -167,8 +168,9 @@ def test_without_unlabelled_samples_it_is_erm_and_says_so():
     assert alone.scheme.name == "erm"
 
 
-def test_semi_supervised_warns_of_its_bias():
-    assert estimate("mean", scalar(), "ss").notes == (BIASED,)
+@pytest.mark.parametrize("loss", ["mean", Quantile(0.5)])
+def test_semi_supervised_warns_of_its_bias(loss):
+    assert estimate(loss, scalar(), "ss").notes == (BIASED,)
 
 
 @pytest.mark.parametrize("entries", [1, 5, 20])
