@@ -20,7 +20,14 @@ from scipy import linalg
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.arrays import Values
 from dtprob.models.prediction_powered.losses import AbstractLoss, named_loss
-from dtprob.models.prediction_powered.moments import Derivatives, Group, evaluate, group_sums, labelled_rows
+from dtprob.models.prediction_powered.moments import (
+    Derivatives,
+    Group,
+    each_part,
+    evaluate,
+    group_sums,
+    labelled_rows,
+)
 from dtprob.models.prediction_powered.quantile import Quantile, quantile_problem
 from dtprob.models.prediction_powered.result import Estimate
 from dtprob.models.prediction_powered.sample import Chunk, Sample, averaged
@@ -183,11 +190,12 @@ def _unlabelled_means(
             for some in _batches(sample.n_unlabelled, len(theta), draws)
         ]
         return Means(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-    group = Group(*(np.asarray(part) for part in evaluate(loss, sample, theta).unlabelled))
+    group = each_part(np.asarray, evaluate(loss, sample, theta).unlabelled)
     n_context, d = group.gradient.shape
     mean = group.gradient.reshape(-1)
-    second = linalg.block_diag(*group.second)
-    size, vectors = np.linalg.eigh((second - np.outer(mean, mean)) / max(sample.n_unlabelled, 1))
+    outer = np.outer(mean, group.offset.reshape(-1))
+    covariance = linalg.block_diag(*group.second) - (outer + outer.T)
+    size, vectors = np.linalg.eigh(covariance / max(sample.n_unlabelled, 1))
     noise = random.standard_normal((draws, len(mean))) * np.sqrt(np.maximum(size, 0.0))
     gradient = (mean + noise @ vectors.T).reshape(draws, n_context, d)
     return Means(np.asarray(gradient), np.broadcast_to(group.hessian, (draws, n_context, d, d)))
@@ -217,7 +225,7 @@ def _quantile_draws(
 ) -> Float[np.ndarray, "draw parameter"]:
     """Woodruff's way: the distribution function is resampled at the estimate and inverted around it."""
     problem = quantile_problem(loss, sample, estimate.scheme)
-    true, unlabelled, predicted = problem.mix(estimate.lam)
+    mix = true, unlabelled, predicted = problem.mix(estimate.lam)
     theta = float(estimate.theta[0])
     prediction = sample.y if sample.prediction is None else sample.prediction
     step = true * (sample.y <= theta) - predicted * (prediction <= theta)
@@ -226,15 +234,4 @@ def _quantile_draws(
     variance = problem.unlabelled_variance(theta)
     noise = random.standard_normal(draws) * np.sqrt(variance)
     shift = labelled - sample.labelled_weight @ step / sample.n + unlabelled * noise
-    function = problem.steps.function(true, unlabelled, predicted)
-    start = function[np.searchsorted(problem.steps.value, theta)]
-    return _inverse(problem.steps.value, np.maximum.accumulate(function), start - shift)[:, None]
-
-
-def _inverse(
-    value: Float[np.ndarray, " value"],
-    function: Float[np.ndarray, " value"],
-    level: Float[np.ndarray, " draw"],
-) -> Float[np.ndarray, " draw"]:
-    index = np.searchsorted(function, level - 1e-12)
-    return value[np.minimum(index, len(value) - 1)]
+    return problem.minimisers(mix, loss.level - shift)[:, None]

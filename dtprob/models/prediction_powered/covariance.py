@@ -6,7 +6,7 @@ from jaxtyping import Float
 
 from dtprob.models.prediction_powered.arrays import Values, compiled_for_jax, namespace
 from dtprob.models.prediction_powered.losses import AbstractLoss
-from dtprob.models.prediction_powered.moments import Evaluation
+from dtprob.models.prediction_powered.moments import Evaluation, centred
 from dtprob.models.prediction_powered.schemes import Mix
 from dtprob.models.prediction_powered.tuning import Practice
 
@@ -69,7 +69,7 @@ def spread(
     inside = evaluation.context[:, None] == xp.arange(evaluation.unlabelled.value.shape[0])
     predicted = inside.astype(inverse.dtype) @ mix.predicted.T * (evaluation.predicted_gradient @ inverse)
     influence = mix.true * (evaluation.gradient @ inverse) - predicted
-    influence = influence - xp.mean(influence, axis=0)
+    influence = centred(influence, evaluation.weight)
     labelled_degrees = xp.maximum(n - lost, 1.0)
     labelled = influence.T @ influence / labelled_degrees / n
     untold = (n <= lost) & xp.eye(
@@ -92,7 +92,8 @@ def _unlabelled(
     inverse: Float[Values, "parameter parameter"],
 ) -> Float[Values, "parameter parameter"]:
     group = evaluation.unlabelled
-    mean = (weight * (group.gradient @ inverse).T).sum(axis=1)
+    mean, offset = ((weight * (part @ inverse).T).sum(axis=1) for part in (group.gradient, group.offset))
     turned = inverse.T @ group.second @ inverse
     second = (weight.T[:, :, None] * weight.T[:, None, :] * turned).sum(axis=0)
-    return second - mean[:, None] * mean
+    outer = mean[:, None] * offset
+    return second - (outer + outer.T)

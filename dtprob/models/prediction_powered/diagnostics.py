@@ -160,7 +160,8 @@ def bias_map(
         [found[i].p_value * (len(found) - rank) for rank, i in enumerate(order)]
     )
     scale, scale_p = _slope(sample.prediction, sample.y, level)
-    shift, feature = _shift(places, sample.x_unlabelled if x is None else None)
+    count = 20 * len(places) if x is None else 0
+    shift, feature = _shift(places, _drawn(sample.x_unlabelled, count, sample.rows_per_chunk))
     return BiasMap(
         regions=tuple(
             _with_p_value(found[i], min(1.0, float(p))) for i, p in zip(order, corrected, strict=True)
@@ -229,10 +230,20 @@ def _slope(prediction: np.ndarray, y: np.ndarray, level: float) -> tuple[Range, 
     return Range(slope, slope - half, slope + half), p_value
 
 
-def _shift(places: np.ndarray, unlabelled: Any) -> tuple[float, int]:
-    if unlabelled is None or not len(unlabelled):
+def _drawn(array: Any, count: int, rows: int) -> np.ndarray | None:
+    """At most `count` rows from all over an array, whose order may mean something; read `rows` at a time."""
+    if array is None or min(count, len(array)) == 0:
+        return None
+    size = len(array)
+    chosen = np.zeros(size, bool)
+    chosen[np.random.default_rng(0).choice(size, min(count, size), replace=False)] = True
+    starts = range(0, size, rows)
+    return np.concatenate([np.asarray(array[i : i + rows])[chosen[i : i + rows]] for i in starts])
+
+
+def _shift(places: np.ndarray, other: np.ndarray | None) -> tuple[float, int]:
+    if other is None:
         return 1.0, 0
-    other = np.asarray(unlabelled[: 20 * len(places)])
     tests: list[float] = []
     for own, others in zip(places.T, other.T, strict=True):
         result: Any = stats.ks_2samp(own, others)

@@ -45,9 +45,10 @@ def estimate(
             the labels, for "cppi" and "tuned_cppi" from K predictors trained without one fold each.
         scheme: "erm", "ss", "ppi", "tuned_ppi", "cppi" or "tuned_cppi".
         lam: weight of the correction, from 0 to 1, instead of the scheme's.
-        by: with a tuned scheme, one lambda overall, per parameter or per context.
+        by: with a tuned scheme, one lambda overall, per parameter or per context (not for a
+            quantile).
         level: of the intervals.
-        practice: conventions for finite samples.
+        practice: conventions for finite samples; for a quantile only those of lambda.
 
     Raises:
         InputError: an unknown name, a level or lambda out of range, data on which the loss has no minimiser.
@@ -56,12 +57,14 @@ def estimate(
     notes: tuple[str, ...] = ()
     if not sample.has_predictions and chosen.name != "erm":
         chosen, notes = named_scheme("erm"), (NO_UNLABELLED,)
+    elif chosen.pooled:
+        notes = (BIASED,)
+    _check_contexts(by, loss, sample, practice)
     if isinstance(loss, Quantile):
         result = estimate_quantile(loss, sample, chosen, level=level, practice=practice)
     else:
-        _check_contexts(by, sample, practice)
         result = _estimate(_problem(named_loss(loss), sample, chosen, practice), by, level)
-    return replace(result, notes=(*notes, *result.notes))
+    return replace(result, notes=notes)
 
 
 def _checked(scheme: Scheme, lam: float | None, level: float) -> Scheme:
@@ -90,7 +93,7 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         evaluation = problem.at(theta)
         inverse = inverse if problem.is_translation else problem.inverse(evaluation, lam)
     found = spread(evaluation, problem.mixes(lam.value), inverse, practice)
-    alone = spread(evaluation, problem.mixes(0 * lam.value), inverse, practice)
+    alone = spread(evaluation, problem.labels_alone(lam), inverse, practice)
     covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
     chance = (1 + level) / 2
     is_normal = practice.reference == "normal"
@@ -109,13 +112,14 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         scheme=problem.scheme,
         n=sample.n,
         n_unlabelled=sample.n_unlabelled if sample.has_predictions else 0,
-        notes=(BIASED,) if problem.scheme.pooled else (),
     )
 
 
-def _check_contexts(by: By, sample: Sample, practice: Practice) -> None:
+def _check_contexts(by: By, loss: str | AbstractLoss | Quantile, sample: Sample, practice: Practice) -> None:
     if by not in get_args(By.__value__):
         raise unknown_name("by", by, get_args(By.__value__), "choice")
+    if by == "context" and isinstance(loss, Quantile):
+        raise InputError("by", "overall, for a quantile", "'context'", "Leave it out, or use SmoothQuantile")
     if by == "context" and practice.form == "estimates":
         remedy = "Use form loss, or tune overall"
         raise InputError("practice", "form loss, to tune by context", "form estimates", remedy)
@@ -181,6 +185,10 @@ class _Problem:
 
     def mixes(self, lam: Float[Values, "*parameter context"]) -> Mix:
         return self.scheme.mix(self.start.n, self.start.n_unlabelled, lam)
+
+    def labels_alone(self, lam: Lambda) -> Mix:
+        """The weights without predictions, which a pooled scheme has at no lambda."""
+        return named_scheme("erm").mix(self.start.n, self.start.n_unlabelled, 0 * lam.value)
 
     def inverse(self, evaluation: Evaluation, lam: Lambda) -> Float[Values, "parameter parameter"]:
         return inverse_hessian(self.loss, evaluation, self.mixes(lam.value.mean(axis=0)))

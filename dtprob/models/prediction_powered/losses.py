@@ -155,7 +155,14 @@ class GeneralizedLinear(AbstractLoss):
         return Traits(linear_in_label=True, quadratic=self.link == "identity", numpy=True)
 
     def start(self, x: Features, y: Labels) -> Parameters:
-        """The origin."""
+        """The origin.
+
+        Raises:
+            InputError: labels with more than one entry, or no features.
+        """
+        check_scalar(y, "a regression")
+        if x.shape[1] == 0:
+            raise InputError("x", "features, for a regression", "none", "Give x, or use the loss mean")
         return namespace(x).zeros(x.shape[1], jnp.result_type(x, y, float))
 
     def values(self, theta: Parameters, x: Features, y: Labels) -> PerSample:
@@ -194,8 +201,13 @@ class SmoothQuantile(AbstractLoss):
         return Traits()
 
     def start(self, x: Features, y: Labels) -> Parameters:
-        """The labels' own quantile."""
+        """The labels' own quantile.
+
+        Raises:
+            InputError: labels with more than one entry.
+        """
         del x
+        check_scalar(y, "a quantile")
         return jnp.quantile(y, self.level)[None]
 
     def values(self, theta: Parameters, x: Features, y: Labels) -> PerSample:
@@ -283,6 +295,17 @@ def named_loss(loss: str | AbstractLoss) -> AbstractLoss:
     if loss not in LOSSES:
         raise unknown_name("loss", loss, LOSSES, "loss")
     return LOSSES[loss]
+
+
+def check_scalar(y: Labels, purpose: str) -> None:
+    """See that a label is one number.
+
+    Raises:
+        InputError: labels with an axis of entries, even of one.
+    """
+    if y.ndim != 1:
+        remedy = "Take one entry at a time, as y[:, 0] with its predictions"
+        raise InputError("y", f"labels of one number, for {purpose}", f"shape {y.shape}", remedy)
 
 
 def _flat(y: Labels) -> Gradients:

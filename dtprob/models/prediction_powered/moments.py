@@ -6,6 +6,7 @@ kept sample by sample.
 
 from collections.abc import Callable, Generator
 from functools import partial
+from operator import add
 from typing import Any, NamedTuple, Self
 
 import equinox as eqx
@@ -28,12 +29,45 @@ class Group(NamedTuple):
         gradient: gradient; the mean of those of all predictors.
         hessian: second derivative.
         second: outer product of the (weighted) gradient with itself.
+        twice: gradient, weighted by the squares of the weights; None where all weights are 1.
+        square: square of the weights; None where all are 1.
     """
 
     value: Float[Values, " context"]
     gradient: Float[Values, "context parameter"]
     hessian: Float[Values, "context parameter parameter"]
     second: Float[Values, "context parameter parameter"]
+    twice: Float[Values, "context parameter"] | None = None
+    square: Float[Values, " context"] | None = None
+
+    @property
+    def squares(self) -> tuple[Float[Values, "context parameter"], Float[Values, ""] | float]:
+        """The gradient weighted by the squares of the weights, and their sum over all contexts."""
+        if self.twice is None or self.square is None:
+            return self.gradient, 1.0
+        return self.twice, self.square.sum()
+
+    @property
+    def offset(self) -> Float[Values, "context parameter"]:
+        """What turns `second` into a covariance: less gradient offset^T + offset gradient^T.
+
+        A mean is divided by the total weight, so that a row adds weight (gradient - mean) to its error.
+        """
+        twice, square = self.squares
+        return twice - square / 2 * self.gradient
+
+
+def each_part(function: Callable[..., Any], *groups: Group) -> Group:
+    """A group of what a function makes of the groups' parts, where there are any."""
+    rows = zip(*groups, strict=True)
+    found: list[Any] = [None if parts[0] is None else function(*parts) for parts in rows]
+    return Group(*found)
+
+
+def centred(rows: Float[Values, "sample ..."], weight: Float[Values, " sample"] | None) -> Values:
+    """What each weighted row adds to the error of a mean that is divided by the total weight."""
+    mean = rows.mean(axis=0)
+    return rows - (mean if weight is None else weight.reshape(-1, *(1 for _ in mean.shape)) * mean)
 
 
 class Evaluation(NamedTuple):
@@ -48,6 +82,7 @@ class Evaluation(NamedTuple):
         context: of each labelled sample.
         n: number of labelled samples.
         n_unlabelled: number of unlabelled samples.
+        weight: of each labelled sample; None where all are 1.
     """
 
     labelled: Group
@@ -58,6 +93,7 @@ class Evaluation(NamedTuple):
     context: Int[Values, " sample"]
     n: Float[Values, ""]
     n_unlabelled: Float[Values, ""]
+    weight: Float[Values, " sample"] | None = None
 
 
 def evaluate(loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"]) -> Evaluation:
@@ -80,6 +116,7 @@ def evaluate(loss: AbstractLoss, sample: Sample, theta: Float[Values, " paramete
         xp.asarray(rows[1].context),
         xp.asarray(sample.n, theta.dtype),
         xp.asarray(max(sample.n_unlabelled, 1), theta.dtype),
+        None if sample.weight is None else xp.asarray(sample.weight),
     )
 
 
@@ -111,8 +148,8 @@ def _unlabelled(
         return _empty(theta, n_context)
     total: Group | None = None
     for sums in _all_sums(loss, sample, theta, n_context):
-        total = sums if total is None else Group(*(a + b for a, b in zip(total, sums, strict=True)))
-    if total is None or not all(np.isfinite(part).all() for part in total):
+        total = sums if total is None else each_part(add, total, sums)
+    if total is None or not all(np.isfinite(part).all() for part in total if part is not None):
         _locate(sample)
         raise InputError(
             "loss",
@@ -127,14 +164,15 @@ def _all_sums(
     loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"], n_context: int
 ) -> Generator[Group]:
     """The sums over one part of the unlabelled samples after another."""
+    weighted = sample.weight_unlabelled is not None
     if not loss.traits.numpy:
         for chunk in sample.chunks(averaged=loss.traits.linear_in_label):
-            yield _chunk_sums(loss, theta, chunk, n_context)
+            yield _chunk_sums(loss, theta, chunk, n_context, weighted=weighted)
         return
     derivatives = Derivatives.of(loss)
     for block in sample.blocks():
         with np.errstate(all="ignore"):
-            sums = _sums(derivatives, theta, block, n_context)
+            sums = _sums(derivatives, theta, block, n_context, weighted=weighted)
         yield sums
 
 
@@ -145,7 +183,7 @@ def _empty(theta: Float[Values, " parameter"], n_context: int) -> Group:
 
 
 def _scaled(group: Group, count: int) -> Group:
-    return Group(*(total / count for total in group))
+    return each_part(lambda total: total / count, group)
 
 
 class Derivatives(NamedTuple):
@@ -164,13 +202,33 @@ class Derivatives(NamedTuple):
         return cls(*methods, linear_in_label=loss.traits.linear_in_label)
 
 
-def group_sums(loss: AbstractLoss, theta: Float[Values, " parameter"], chunk: Chunk, n_context: int) -> Group:
-    """Weighted sums of loss, gradient, second derivative and squared gradient, per context."""
-    return _sums(Derivatives.of(loss), theta, chunk, n_context)
+def group_sums(
+    loss: AbstractLoss,
+    theta: Float[Values, " parameter"],
+    chunk: Chunk,
+    n_context: int,
+    *,
+    weighted: bool = False,
+) -> Group:
+    """Weighted sums of loss, gradient, second derivative and squared gradient, per context.
+
+    Args:
+        loss: the loss.
+        theta: parameters.
+        chunk: the samples.
+        n_context: number of contexts.
+        weighted: sum with the squares of the weights too.
+    """
+    return _sums(Derivatives.of(loss), theta, chunk, n_context, weighted=weighted)
 
 
 def _sums(
-    derivatives: Derivatives, theta: Float[Values, " parameter"], chunk: Chunk, n_context: int
+    derivatives: Derivatives,
+    theta: Float[Values, " parameter"],
+    chunk: Chunk,
+    n_context: int,
+    *,
+    weighted: bool,
 ) -> Group:
     x, prediction, weight, context = chunk
     if derivatives.linear_in_label:
@@ -179,12 +237,13 @@ def _sums(
     gradients = _over_predictors(lambda y: derivatives.gradients(theta, x, y), prediction)
 
     def of_context(masked: Any) -> Group:
-        weighted = masked[:, None] * gradients
+        rows = masked[:, None] * gradients
         hessian = _over_predictors(lambda y: derivatives.hessian(theta, x, y, masked), prediction)
-        return Group(masked @ values, masked @ gradients, hessian, weighted.T @ weighted)
+        squares = (masked @ rows, masked @ masked) if weighted else (None, None)
+        return Group(masked @ values, masked @ gradients, hessian, rows.T @ rows, *squares)
 
     if n_context == 1:
-        return Group(*(total[None] for total in of_context(weight)))
+        return each_part(lambda total: total[None], of_context(weight))
     masks = weight * (context == namespace(context).arange(n_context)[:, None])
     return each(of_context, masks)
 

@@ -21,7 +21,7 @@ type Predictor = Callable[[np.ndarray], np.ndarray]
 
 
 class Chunk(NamedTuple):
-    """Consecutive unlabelled samples; rows added to fill a chunk have weight 0."""
+    """Consecutive unlabelled samples; a chunk is filled with copies of its last row, of weight 0."""
 
     x: Float[Values, "sample feature"]
     prediction: Float[Values, "sample fold ..."]
@@ -203,10 +203,11 @@ class Sample:
             size = here.stop - start
             x = np.zeros((size, 0)) if self.x_unlabelled is None else np.asarray(self.x_unlabelled[here])
             given = self.prediction_unlabelled
-            prediction = np.asarray(given(x) if callable(given) else given[here])
+            told = np.asarray(given(x) if callable(given) else given[here])
+            prediction = _real("prediction_unlabelled", told)
             weight, context = self.weight_unlabelled, self.context_unlabelled
             yield Chunk(
-                x,
+                _real("x_unlabelled", x),
                 prediction.reshape(_prediction_shape(prediction.shape, size, self.y.shape[1:])),
                 ones[:size] if weight is None else weight[here],
                 zeros[:size] if context is None else context[here],
@@ -228,14 +229,15 @@ def _averaged(chunk: Chunk) -> Chunk:
 
 
 def _filled(chunk: Chunk, size: int) -> Chunk:
-    """JAX's arrays of `size` rows."""
+    """JAX's arrays of `size` rows; a loss need not be finite but where there are samples, so the last is repeated."""
     short = size - len(chunk.weight)
 
     def filled(array: Values) -> Array:
         whole = jnp.asarray(array)
-        return jnp.pad(whole, [(0, short), *[(0, 0)] * (whole.ndim - 1)]) if short else whole
+        return jnp.concatenate([whole, jnp.repeat(whole[-1:], short, axis=0)]) if short else whole
 
-    return Chunk(*(filled(part) for part in chunk))
+    weight = jnp.pad(jnp.asarray(chunk.weight), (0, short))
+    return Chunk(*(filled(part) for part in chunk))._replace(weight=weight)
 
 
 def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]) -> tuple[int, ...]:
@@ -248,10 +250,15 @@ def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]
     raise InputError("prediction_unlabelled", expected, str(shape), "Give a prediction per unlabelled sample")
 
 
-def _finite(name: str, array: np.ndarray) -> np.ndarray:
+def _real(name: str, array: np.ndarray) -> np.ndarray:
+    """As numbers with a fraction, so that a mean of whole numbers or of yes and no is right."""
     if array.dtype.kind not in "fiub":
         raise InputError(name, "real numbers", f"values of type {array.dtype}", f"Give {name} as numbers")
-    array = array.astype(np.result_type(array.dtype, np.float32), copy=False)
+    return array.astype(np.result_type(array.dtype, np.float32), copy=False)
+
+
+def _finite(name: str, array: np.ndarray) -> np.ndarray:
+    array = _real(name, array)
     bad = ~np.isfinite(array)
     if bad.any():
         place = tuple(int(i) for i in np.argwhere(bad)[0])

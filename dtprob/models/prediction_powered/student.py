@@ -148,7 +148,7 @@ def per_step_lambda(network: Neural, parameters: Any, groups: Groups) -> Scalar:
     """The weight of the correction with the least mean square error of the step, in [0, 1].
 
     With g and f the gradients of the labelled samples' losses at labels and at predictions it is
-    sum <g - mean g, f - mean f> / ((1 + n / N) sum |f - mean f|^2).
+    sum <g - mean g, f - mean f> / ((1 + n / N) sum |f - mean f|^2), each difference times its sample's weight.
 
     Args:
         network: what is trained.
@@ -172,9 +172,15 @@ def per_step_lambda(network: Neural, parameters: Any, groups: Groups) -> Scalar:
 
         return ravel_pytree(jax.grad(loss)(parameters))[0]
 
+    def offset(rows: Rows) -> Float[Array, " parameter"]:
+        """Half the mean, or what stands for it where weights differ."""
+        weight = rows.weight
+        return mean_gradient(rows._replace(weight=weight * (weight - jnp.mean(weight**2) / 2)))
+
     n, count = len(groups.true.x), len(groups.unlabelled.x)
     cross, square = jax.lax.map(of_sample, (groups.true, groups.predicted), batch_size=min(n, _AT_ONCE))
     g, f = mean_gradient(groups.true), mean_gradient(groups.predicted)
-    top, bottom = jnp.sum(cross) - n * g @ f, jnp.sum(square) - n * f @ f
+    own, other = offset(groups.true), offset(groups.predicted)
+    top, bottom = jnp.sum(cross) - n * (g @ other + f @ own), jnp.sum(square) - 2 * n * f @ other
     ratio = top / jnp.where(bottom > 0, (1 + n / count) * bottom, 1.0)
     return jnp.where(bottom > 0, jnp.clip(ratio, 0.0, 1.0), 0.0)

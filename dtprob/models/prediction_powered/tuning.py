@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.arrays import Values, compiled_for_jax, each, namespace
-from dtprob.models.prediction_powered.moments import Evaluation, Group
+from dtprob.models.prediction_powered.moments import Evaluation, centred, each_part
 
 type By = Literal["overall", "parameter", "context"]
 
@@ -114,7 +114,7 @@ def tune(
 def _merged(evaluation: Evaluation) -> Evaluation:
     """The data as if all contexts were one."""
     predicted, unlabelled = (
-        Group(*(part.sum(axis=0, keepdims=True) for part in group))
+        each_part(lambda part: part.sum(axis=0, keepdims=True), group)
         for group in (evaluation.predicted, evaluation.unlabelled)
     )
     context = namespace(evaluation.context).zeros_like(evaluation.context)
@@ -161,13 +161,14 @@ def projections(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> t
     f = evaluation.predicted_gradient @ root
     inside = evaluation.context[:, None] == xp.arange(n_context)
     f = inside[:, :, None] * f[:, None, :]
-    return g - g.mean(axis=0), f - f.mean(axis=0)
+    return centred(g, evaluation.weight), centred(f, evaluation.weight)
 
 
 def unlabelled_covariance(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> Values:
     """Covariance between contexts of the unlabelled gradients, summed over directions, (context, context)."""
-    mean = evaluation.unlabelled.gradient @ root
-    return namespace(mean).diag(_squares(evaluation, root)) - mean @ mean.T
+    mean, offset = (part @ root for part in (evaluation.unlabelled.gradient, evaluation.unlabelled.offset))
+    outer = mean @ offset.T
+    return namespace(mean).diag(_squares(evaluation, root)) - (outer + outer.T)
 
 
 def _squares(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> Float[Values, " context"]:
@@ -178,14 +179,18 @@ def _squares(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> Floa
 def _pooled(evaluation: Evaluation, root: Float[Values, "parameter r"]) -> Values:
     """Covariance of labelled and unlabelled gradients taken together, as of one sample."""
     xp = namespace(evaluation.gradient)
-    n, count = evaluation.n, evaluation.n_unlabelled
-    f = evaluation.predicted_gradient
-    n_context = evaluation.unlabelled.value.shape[0]
+    n, count, total = evaluation.n, evaluation.n_unlabelled, evaluation.n + evaluation.n_unlabelled
+    f, weight, unlabelled = evaluation.predicted_gradient, evaluation.weight, evaluation.unlabelled
+    n_context = unlabelled.value.shape[0]
     inside = (evaluation.context[:, None] == xp.arange(n_context)).astype(f.dtype)
-    mean = (count * evaluation.unlabelled.gradient + inside.T @ f) / (n + count) @ root
+    twice, square = unlabelled.squares
+    own_twice, own_square = (f, n) if weight is None else (weight[:, None] * f, weight @ weight)
+    mean = (count * unlabelled.gradient + inside.T @ f) / total
+    offset = (count * twice + inside.T @ own_twice) / total - (count * square + own_square) / total / 2 * mean
+    outer = (mean @ root) @ (offset @ root).T
     labelled = xp.einsum("nc,nr->c", inside, (f @ root) ** 2)
     second = count * _squares(evaluation, root) + labelled
-    return (xp.diag(second) - (n + count) * (mean @ mean.T)) / (n + count - 1)
+    return (xp.diag(second) - total * (outer + outer.T)) / (total - 1)
 
 
 def _standard_error(

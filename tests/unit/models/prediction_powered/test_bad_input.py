@@ -1,6 +1,7 @@
 """Every wrong input gives one line that says what to do."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -9,6 +10,7 @@ from dtprob.models.prediction_powered.bootstrap import bootstrap
 from dtprob.models.prediction_powered.diagnostics import bias_map
 from dtprob.models.prediction_powered.estimate import estimate
 from dtprob.models.prediction_powered.generalised import posterior_data
+from dtprob.models.prediction_powered.losses import SmoothQuantile
 from dtprob.models.prediction_powered.predictors import Ridge
 from dtprob.models.prediction_powered.quantile import Quantile
 from dtprob.models.prediction_powered.sample import Sample
@@ -61,6 +63,26 @@ CALLS = {
     ),
     "quantile level": (lambda: Quantile(1.0), "quantile: expected a level between 0 and 1"),
     "quantile of vectors": (lambda: estimate(Quantile(0.5), Sample(y=X), "erm"), "y: expected labels of one"),
+    "smooth quantile of vectors": (
+        lambda: estimate(SmoothQuantile(0.5, jnp.asarray(0.3)), Sample(y=X), "erm"),
+        "y: expected labels of one number, for a quantile",
+    ),
+    "regression of a column": (
+        lambda: estimate("ols", Sample(x=X, y=Y[:, None]), "erm"),
+        r"y: expected labels of one number, for a regression, got shape \(6, 1\)\. Take .* y\[:, 0\]",
+    ),
+    "regression on nothing": (
+        lambda: estimate("logistic", Sample(y=Y > 2), "erm"),
+        "x: expected features, for a regression, got none",
+    ),
+    "by nothing that there is": (
+        lambda: estimate(Quantile(0.5), scalar(), by="nonsense"),
+        "by: expected one of the choices context, overall, parameter, got 'nonsense'",
+    ),
+    "quantile by context": (
+        lambda: estimate(Quantile(0.5), scalar(), by="context"),
+        "by: expected overall, for a quantile, got 'context'",
+    ),
     "posterior of a quantile": (
         lambda: posterior_data(Quantile(0.5), scalar(), estimate(Quantile(0.5), scalar())),
         "loss: expected one with a second derivative",

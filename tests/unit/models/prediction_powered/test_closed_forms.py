@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from dtprob.models.prediction_powered.estimate import BIASED, NO_UNLABELLED, estimate
+from dtprob.models.prediction_powered.quantile import Quantile
 from dtprob.models.prediction_powered.sample import Sample
 from dtprob.models.prediction_powered.tuning import Practice
 from tests.unit.models.prediction_powered.examples import linear, scalar
@@ -57,6 +58,13 @@ def test_variance_is_its_formula():
     }
     for scheme, variance in variances.items():
         assert estimate("mean", sample, scheme).covariance[0, 0] == pytest.approx(variance, rel=1e-12)
+
+
+@pytest.mark.parametrize("scheme", ["erm", "ss", "ppi", "tuned_ppi", "cppi", "tuned_cppi"])
+def test_labels_alone_have_their_own_variance_under_every_scheme(scheme):
+    sample = scalar()
+    found = estimate("mean", sample, scheme)
+    assert found.labels_only_variance == pytest.approx([sample.y.var(ddof=1) / sample.n], rel=1e-12)
 
 
 @pytest.mark.parametrize("lam", [0.0, 0.4, 1.0])
@@ -160,8 +168,9 @@ def test_without_unlabelled_samples_it_is_erm_and_says_so():
     assert alone.scheme.name == "erm"
 
 
-def test_semi_supervised_warns_of_its_bias():
-    assert estimate("mean", scalar(), "ss").notes == (BIASED,)
+@pytest.mark.parametrize("loss", ["mean", Quantile(0.5)])
+def test_semi_supervised_warns_of_its_bias(loss):
+    assert estimate(loss, scalar(), "ss").notes == (BIASED,)
 
 
 @pytest.mark.parametrize("entries", [1, 5, 20])

@@ -62,6 +62,22 @@ def test_a_moved_feature_is_named():
     assert found.shift_p_value < 1e-6
 
 
+ORDERS = {
+    "sorted": np.arange(100_000) / 100_000,
+    "a grid, row by row": np.arange(100_000) % 100 / 100,  # equal steps of 100 would all hit one column
+}
+
+
+@pytest.mark.parametrize("chunk", [None, 3000])
+@pytest.mark.parametrize("order", ORDERS)
+def test_the_order_of_unlabelled_samples_is_no_shift(order, chunk):
+    x, other = np.random.default_rng(7).random((50, 1)), ORDERS[order][:, None]
+    fields = {"x": x, "y": x[:, 0], "prediction": x[:, 0], "prediction_unlabelled": other[:, 0]}
+    alike, moved = (Sample(**fields, x_unlabelled=each, chunk=chunk) for each in (other, other**4))
+    assert bias_map(alike).shift_p_value > 0.05
+    assert bias_map(moved).shift_p_value < 1e-6
+
+
 def test_one_label_in_a_region_proves_nothing():
     sample = Sample(y=np.array([1.0]), prediction=np.array([0.9]), x=np.zeros((1, 1)))
     (region,) = bias_map(sample, per_region=1).regions

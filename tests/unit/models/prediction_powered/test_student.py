@@ -48,24 +48,28 @@ def test_batches_of_unlabelled_samples_lead_to_the_same_place():
     assert np.sqrt(np.mean((np.asarray(taught.predict(sample.x[:, 1:])) - expected) ** 2)) < 0.05
 
 
-def groups(y, prediction, count=500):
+def groups(y, prediction, count=500, weight=None):
     x = np.random.default_rng(1).normal(size=(len(y), 2))
-    ones, unlabelled = jnp.ones(len(y)), Rows(jnp.zeros((count, 2)), jnp.zeros(count), jnp.ones(count))
-    rows = (Rows(jnp.asarray(x), jnp.asarray(labels), ones) for labels in (y, prediction))
+    unlabelled = Rows(jnp.zeros((count, 2)), jnp.zeros(count), jnp.ones(count))
+    own = jnp.ones(len(y)) if weight is None else jnp.asarray(weight)
+    rows = (Rows(jnp.asarray(x), jnp.asarray(labels), own) for labels in (y, prediction))
     return Groups(*rows, unlabelled)
 
 
-def test_lambda_of_a_step_is_the_ratio_of_covariances():
+@pytest.mark.parametrize("weighted", [False, True])
+def test_lambda_of_a_step_is_the_ratio_of_covariances(weighted):
     rng = np.random.default_rng(2)
     y = rng.normal(size=300)
-    prediction = y + rng.normal(size=300)
-    data, network = groups(y, prediction), line()
+    prediction = y + rng.normal(size=300) + 5 * weighted
+    weight = rng.exponential(size=300) if weighted else np.ones(300)
+    weight /= weight.mean()
+    data, network = groups(y, prediction, weight=weight), line()
     parameters = network.init(KEY, data.true.x)
     output = np.asarray(network.apply(parameters, data.true.x))[:, 0]
     # The squared loss of a line: its gradients in slopes and constant.
     design = np.column_stack([data.true.x, np.ones(300)])
     g, f = (2 * (output - labels)[:, None] * design for labels in (y, prediction))
-    g, f = g - g.mean(axis=0), f - f.mean(axis=0)
+    g, f = (weight[:, None] * (part - weight @ part / 300) for part in (g, f))
     expected = np.sum(g * f) / ((1 + 300 / 500) * np.sum(f * f))
     assert 0 < expected < 1
     assert float(per_step_lambda(network, parameters, data)) == pytest.approx(expected, rel=1e-9)
