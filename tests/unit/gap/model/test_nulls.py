@@ -1,5 +1,6 @@
 """Effects that change the model where they should do nothing are refused; those that do nothing are not."""
 
+import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -33,6 +34,31 @@ def test_a_constant_that_is_always_added_is_refused():
     lifted = Effect("lifted", {"mean": lambda v, p, c: v + 0.01 + p["c"]}, (Parameter("c", dist.Normal()),))
     with pytest.raises(InputError, match="effect lifted"):
         check_nulls(Problem(line, draw("line"), [lifted]))
+
+
+def test_a_name_that_the_library_has_excuses_no_effect():
+    lifted = Effect(
+        "gain_offset",
+        {"mean": lambda v, p, c: v + c["x"] + p["b"] * c["x"]},
+        (Parameter("b", dist.Normal()),),
+    )
+    with pytest.raises(InputError, match="effect gain_offset: expected site 'mean' unchanged at its null"):
+        check_nulls(Problem(line, draw("line"), [lifted]))
+
+
+@pytest.mark.parametrize(
+    "rewrite",
+    [
+        lambda v, p, c: v + c["x"] + p["s"] * p["field"],
+        lambda v, p, c: v + (0.01 + p["s"]) * p["field"],
+        lambda v, p, c: v * jnp.exp((1.0 + p["s"]) * p["field"]),
+    ],
+    ids=["always", "spread", "factor"],
+)
+def test_a_random_field_that_changes_the_model_at_size_zero_is_refused(rewrite):
+    field = Effect("field", {"mean": rewrite}, (Parameter("s", dist.HalfNormal()),), kind="variance")
+    with pytest.raises(InputError, match="effect field: expected site 'mean' unchanged at its null, s = 0"):
+        check_nulls(Problem(line, draw("line"), [field]))
 
 
 def test_effects_that_do_nothing_there_pass():
