@@ -84,12 +84,11 @@ def _offered(family: str, sites: Sites, data: Data) -> list[Effect]:
 
 
 def _finds_its_needs(effect: Effect, sites: Sites, data: Data) -> bool:
-    order = list(sites)
-    return all(
-        need in data or need == site or need in order[: order.index(site)]
-        for site in effect.sites
-        for need in effect.requires
-    )
+    """What it rewrites itself has to come before its other sites, all else before the last of them."""
+    when = {name: place for place, name in enumerate(sites)}
+    own = sorted(when[site] for site in effect.sites)
+    latest = {need: own[0] if need in effect.sites else own[-1] - 1 for need in effect.requires}
+    return all(need in data or when.get(need, len(when)) <= latest[need] for need in effect.requires)
 
 
 def _named(name: str, sites: Sites, data: Data) -> list[Effect]:
