@@ -41,6 +41,7 @@ def label_twin(
         The predicted labels.
     """
     del x
+    prediction = jnp.asarray(prediction, float)  # maps of whole decibels are numbers like others
     deviation: Any = numpyro.sample("error_deviation", _size_of_errors(prediction))
     predicted: Any = numpyro.deterministic("predicted_label", prediction)
     spread: Any = numpyro.deterministic("label_deviation", jnp.broadcast_to(deviation, prediction.shape))

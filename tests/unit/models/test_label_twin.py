@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 import pytest
 
 from dtprob.case import load_case
@@ -165,6 +166,15 @@ def test_a_predictor_without_bias_has_no_gap():
         label_twin, data, effects, key=jax.random.key(1), engine=Laplace(draws=200), settings=SETTINGS
     )
     assert found.verdict == "NO_GAP"
+
+
+def test_maps_of_whole_decibels_are_numbers_like_others():
+    """Else no effect could move them by less than one."""
+    prediction = np.arange(-90, -60)
+    with numpyro.handlers.seed(rng_seed=0):
+        trace = numpyro.handlers.trace(label_twin).get_trace(np.zeros((30, 1)), prediction)
+    assert jnp.issubdtype(trace["predicted_label"]["value"].dtype, jnp.floating)
+    np.testing.assert_array_equal(trace["predicted_label"]["value"], prediction)
 
 
 def test_labelled_rows():
