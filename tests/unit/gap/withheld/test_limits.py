@@ -145,7 +145,7 @@ def test_the_rows_of_a_score():
     assert line(found, "seconds")["of"] == 7
     page = render_score(found)
     assert "F1 of the cells touched" in page
-    assert "\N{GREATER-THAN OR EQUAL TO} 0.97" in page
+    assert "\N{GREATER-THAN OR EQUAL TO}&nbsp;0.97" in page
 
 
 def test_no_answer_changes_what_is_imitated():
