@@ -192,6 +192,9 @@ def test_luck_that_cannot_be_repeated_is_noticed_or_allowed():
     other = PlayedNetwork(changing_network(), 1, 1, replay=False)
     other.go_on(rows)
     assert other.play(TURNS, 3, np.random.default_rng(0))["episode"].tolist() == [1, 1, 1]
+    again = PlayedNetwork(changing_network(), 0, 1, replay=False)
+    again.go_on(rows)
+    assert not np.array_equal(again.play(TURNS, 50, np.random.default_rng(0))["arrival"], rows["arrival"])
 
 
 @pytest.mark.parametrize(
