@@ -210,6 +210,11 @@ def test_luck_that_cannot_be_repeated_is_noticed_or_allowed():
         ("disconnect = [[500, 1]]", "disconect = [[500, 1]]", "what multi_access takes"),
         ('environment = "multi_access"', 'environment = "own:made"', "--no-code"),
         ('environment = "multi_access"', 'log = "no.csv"', "no.csv"),
+        ("[loop]", '[effects]\nuse = "device_disconected"\n[loop]', "Did you mean 'device_disconnected'?"),
+        ("[loop]", '[effects]\nexclude = ["bias"]\n[loop]', "[effects] exclude: expected one of"),
+        ("[loop]", '[effects]\nknown = ["drift"]\n[loop]', "[effects] known: expected nothing"),
+        ("clusters", "capacity = 1.5\nclusters", "options capacity: expected a whole number, got 1.5"),
+        ("clusters", 'traffic = ["markov"]\nclusters', "options traffic: expected text"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, old, new, told):
