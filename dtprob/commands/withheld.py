@@ -16,7 +16,7 @@ from pebble import ProcessExpired, ProcessPool
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
-from dtprob.files import sha256, write_text
+from dtprob.files import make_folder, sha256, write_text
 
 TRACKS: Final = {
     "channel": "dtprob.physical.cases",
@@ -53,6 +53,7 @@ def generate(
     if count < 1 or seed < 0:
         got = f"count {count}, seed {seed}"
         raise InputError("withheld generate", "a count from 1 and a seed from 0", got, "Correct them")
+    make_folder(out)
     from dtprob.commands.run import session  # noqa: PLC0415  (heavy)
 
     with session() as say:
@@ -89,7 +90,7 @@ def run(
         resume: keep the answers that are there, where case, seed and dtprob's own code are what they were.
 
     Raises:
-        InputError: no cases, or a number of workers below 1.
+        InputError: no cases, a number of workers below 1, or answers that are no folder.
         RuntimeError: some cases could not be diagnosed; why lies in OUT/NAME/error.txt.
     """
     found = sorted(path.parent.name for path in cases.glob("*/case.toml"))
@@ -98,6 +99,7 @@ def run(
         raise InputError(
             f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
         )
+    make_folder(out)
     wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
     jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in found]
     jobs = [job for job in jobs if any(not job.keeps(file) for file in wanted)]

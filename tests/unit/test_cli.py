@@ -54,6 +54,9 @@ name = "laplace"
 """
 
 
+EXAMPLE = str(Path(__file__).parents[2] / "examples" / "network" / "twin.toml")
+
+
 @pytest.fixture
 def case(tmp_path) -> Path:
     rng = np.random.default_rng(0)
@@ -222,6 +225,21 @@ def test_a_failure_of_the_job_is_status_1(case, capsys, tmp_path):
 def test_out_that_is_a_file(case, capsys, tmp_path):
     (tmp_path / "out").write_text("")
     assert main(["fit", str(case), "--out", str(tmp_path / "out")]) == 2
+    assert "expected a folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("demo",),
+        ("reproduce", "fig2"),
+        ("twin", "run", EXAMPLE),
+        ("withheld", "generate", "--track", "custom", "--count", "1"),
+    ],
+)
+def test_out_that_is_a_file_is_said_before_any_work(words, capsys, tmp_path):
+    (tmp_path / "out").write_text("")
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
     assert "expected a folder" in capsys.readouterr().err
 
 
