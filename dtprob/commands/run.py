@@ -112,6 +112,8 @@ def infer(
         checkpoint=checkpoint,
         resume=resume,
     )
+    for earlier in (identity, file):  # what breaks off leaves no posterior of another run
+        earlier.unlink(missing_ok=True)
     run.say(f"fitting with {prepared.engine.name}")
     posterior = prepared.engine(prepared.key, prepared.model, data, options=options)
     posterior.save(file)

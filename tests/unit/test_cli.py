@@ -322,7 +322,7 @@ def test_a_failed_run_leaves_no_results_of_an_earlier_one(case, tmp_path):
     (tmp_path / "broken_model.py").write_text(MODEL.replace("slope * x", "slope * x / undefined"))
     change(case, "line_model", "broken_model")
     assert main(["fit", str(case), "--out", str(out)]) == 1
-    assert not (out / "summary.json").exists()
+    assert not any((out / name).exists() for name in ("summary.json", "posterior.nc", "posterior.identity"))
 
 
 def test_list(capsys):
