@@ -63,6 +63,7 @@ def run(twin_case: Path, out: Path, *, seed: int | None, no_code: bool, resume: 
         if state.slots:
             twin.physical.go_on(state.rows)
             say(f"going on in round {state.round} at slot {state.slots}: {state.phase}")
+            _write(case, state, out)  # the run may have ended between the state and what people read of it
         while not finished(state):
             state = advance(twin, state)
             _write(case, state, out)

@@ -231,3 +231,14 @@ def test_a_state_of_another_case_is_refused(case, tmp_path):
     other = dataclasses.replace(case, loop=dataclasses.replace(case.loop, window=20))
     with pytest.raises(InputError, match="the state of this case"):
         load(other, tmp_path / "state.npz")
+
+
+def test_what_people_read_is_written_though_the_run_had_ended(case, tmp_path):
+    """A run that was killed between its last state and history.json."""
+    rows = connect(case).play(TURNS, 20, np.random.default_rng(0))
+    save(begin(case)._replace(rows=rows, phase="done"), case, tmp_path / "state.npz")
+    assert main(["twin", "run", str(case.path), "--out", str(tmp_path), "--resume"]) == 0
+    told = json.loads((tmp_path / "history.json").read_text())
+    assert told["finished"]
+    assert told["slots"] == 20
+    assert (tmp_path / "log.csv").is_file()
