@@ -90,7 +90,7 @@ def run(
         resume: keep the answers that are there, where case, seed and dtprob's own code are what they were.
 
     Raises:
-        InputError: no cases, a number of workers below 1, or answers that are no folder.
+        InputError: no cases, a number of workers below 1, a seed below 0, or answers that are no folder.
         RuntimeError: some cases could not be diagnosed; why lies in OUT/NAME/error.txt.
     """
     found = sorted(path.parent.name for path in cases.glob("*/case.toml"))
@@ -99,6 +99,8 @@ def run(
         raise InputError(
             f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
         )
+    if seed is not None and seed < 0:
+        raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
     make_folder(out)
     wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
     jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in found]

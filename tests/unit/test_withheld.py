@@ -162,3 +162,22 @@ def test_wrong_input(words, text, capsys, tmp_path, monkeypatch):
         status = stop.code
     assert status == 2
     assert text in capsys.readouterr().err
+
+
+def _one_case(folder):
+    """A case whose answer, and whose failure before, are there."""
+    own, answer = folder / "cases" / "a", folder / "answers" / "a"
+    own.mkdir(parents=True)
+    answer.mkdir(parents=True)
+    (own / "case.toml").write_text(CASE)
+    (answer / "report.json").write_text("{}")
+    (answer / "error.txt").write_text("why it failed before")
+    return own, answer
+
+
+def test_a_wrong_seed_costs_no_answers(tmp_path, capsys):
+    own, answer = _one_case(tmp_path)
+    words = ["withheld", "run", str(own.parent), "--out", str(answer.parent), "--seed", "-1"]
+    assert main(words) == 2
+    assert "--seed: expected a whole number from 0, got -1" in capsys.readouterr().err
+    assert (answer / "report.json").is_file()
