@@ -217,7 +217,8 @@ def _diagnose(job: _Job) -> str | None:
     answers = {"report.json": answer, "rivals.json": answer_of_rivals}
     job.folder.mkdir(parents=True, exist_ok=True)
     todo = [file for file in job.wanted if not job.keeps(file)]
-    for file in todo if job.is_same else (*answers, "timing.json"):
+    gone = todo if job.is_same else (*answers, "timing.json")
+    for file in (*gone, "error.txt"):
         (job.folder / file).unlink(missing_ok=True)  # what breaks off has no answer, not an older one
     write_text(job.folder / _IDENTITY, job.identity)
     try:

@@ -181,3 +181,17 @@ def test_a_wrong_seed_costs_no_answers(tmp_path, capsys):
     assert main(words) == 2
     assert "--seed: expected a whole number from 0, got -1" in capsys.readouterr().err
     assert (answer / "report.json").is_file()
+
+
+def test_a_case_that_breaks_off_keeps_no_older_failure(tmp_path, monkeypatch):
+    """A score would count that failure, though this run has not ended."""
+    own, answer = _one_case(tmp_path)
+
+    def killed(path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dtprob.case.load_case", killed)
+    job = withheld._Job(own, answer, ("report.json",), seed=None, no_code=False, resume=False)
+    with pytest.raises(KeyboardInterrupt):
+        withheld._diagnose(job)
+    assert {entry.name for entry in answer.iterdir()} == {"identity.txt"}
