@@ -124,9 +124,10 @@ def test_a_recurrent_policy_runs_on_a_device_as_it_was_trained(tmp_path):
 
 
 def test_what_is_no_recurrent_policy_is_refused(tmp_path):
-    (tmp_path / "policy.npz").write_text("nothing")
-    with pytest.raises(InputError, match="a policy"):
-        load(tmp_path / "policy.npz")
+    for content in ("nothing", "", "PK\x03\x04 cut off"):
+        (tmp_path / "policy.npz").write_text(content)
+        with pytest.raises(InputError, match="a policy"):
+            load(tmp_path / "policy.npz")
     with pytest.raises(InputError, match=r"the suffix \.npz"):
         save(HistoryPolicy(KEY, 4), tmp_path / "policy.json")
     save(HistoryPolicy(KEY, 4), tmp_path / "policy.npz")

@@ -242,3 +242,10 @@ def test_what_people_read_is_written_though_the_run_had_ended(case, tmp_path):
     assert told["finished"]
     assert told["slots"] == 20
     assert (tmp_path / "log.csv").is_file()
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"no archive"])
+def test_what_is_no_state_is_refused(case, tmp_path, content):
+    (tmp_path / "state.npz").write_bytes(content)
+    with pytest.raises(InputError, match="Begin without --resume"):
+        load(case, tmp_path / "state.npz")
