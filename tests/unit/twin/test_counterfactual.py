@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from dtprob.data import NetworkLog
 from dtprob.errors import InputError
 from dtprob.inference import PointMass
 from dtprob.inference.exact import DirichletTables
@@ -116,3 +117,35 @@ def test_transitions_carry_the_slot_before(log):
 def test_several_episodes_are_not_taken_for_one(posterior):
     with pytest.raises(InputError, match="episode: expected the slots of one, got those of 2"):
         what_if(jax.random.key(0), SYSTEM, posterior, simulate(12, 3, episodes=2), draws=3)
+
+
+def idle(slots, packets, first=0):
+    """Four devices whose buffers hold some packets, and in which nothing happens."""
+    nothing = np.zeros((slots, 4), int)
+    return NetworkLog(
+        episode=np.zeros(slots, int),
+        slot=np.arange(first, first + slots),
+        buffer=nothing + packets,
+        action=nothing,
+        ack=nothing,
+        arrival=nothing,
+    )
+
+
+def test_an_episode_of_another_network_is_refused(posterior):
+    """Run again with smaller buffers, or with other devices, it would not be the logged one."""
+    with pytest.raises(InputError, match="buffer_0: expected 1 packets, as capacity 1 leaves, got 2"):
+        what_if(jax.random.key(0), SYSTEM, posterior, idle(5, 2), draws=3)
+    what_if(jax.random.key(0), kernel(CLUSTERS, 2), posterior, idle(5, 2), draws=3)
+    with pytest.raises(InputError, match="expected 2 devices, as in the network, got 4"):
+        what_if(jax.random.key(0), kernel(((0, 1),)), posterior, idle(5, 1), draws=3)
+
+
+def test_a_policy_meets_the_slots_of_the_log(posterior):
+    """A log that begins in slot 3 of its episode is in another slot of a frame than one that begins in slot 0."""
+
+    def in_the_fifth(key, state):
+        return jnp.full(4, state.slot == 5)
+
+    slots = what_if(jax.random.key(0), SYSTEM, posterior, idle(5, 1, 3), policy=in_the_fifth, draws=40)
+    assert np.asarray(slots.collision).any(axis=0).tolist() == [False, False, True, False, False]
