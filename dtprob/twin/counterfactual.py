@@ -20,7 +20,7 @@ from dtprob.errors import InputError
 from dtprob.inference.posterior import Sampler
 from dtprob.models.multi_access.abduction import Transition, abduct
 from dtprob.models.multi_access.transition import Kernel, State
-from dtprob.twin.predict import sampled
+from dtprob.twin.predict import Prediction, check_counts, sampled
 from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, rollout
 
 SITES = ("log_arrival", "log_reception")
@@ -62,12 +62,11 @@ class Effect:
         return float(self.differences.mean())
 
     def interval(self, level: float = 0.9) -> tuple[float, float]:
-        """Credible limits of the average treatment effect, over draws of the parameters."""
-        if not 0 < level < 1:
-            raise InputError("level of an interval", "between 0 and 1", f"{level:g}", "Correct it")
-        tail = (1 - level) / 2
-        low, high = np.quantile(self.differences.mean(axis=1), [tail, 1 - tail])
-        return float(low), float(high)
+        """Credible limits of the average treatment effect, over draws of the parameters.
+
+        They are freed of the noise of few episodes, as those of an expected metric are.
+        """
+        return Prediction(self.differences).expected_interval(level)
 
 
 def average_effect(
@@ -98,8 +97,9 @@ def average_effect(
         sites: the parameters that the kernel takes.
 
     Raises:
-        InputError: the sampler lacks a site.
+        InputError: counts below 1, fewer than 2 episodes, or a sampler that lacks a site.
     """
+    check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
 
@@ -193,8 +193,9 @@ def what_if(
         The slots, each field (draw, slot, ...).
 
     Raises:
-        InputError: an episode of another network, or one that could not happen under a draw of the parameters.
+        InputError: no draws, an episode of another network, or one that could not happen under a draw of the parameters.
     """
+    check_counts({"draws": (draws, 1)})
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, SITES)
     happened = transitions(episode)
     _check_buffers(kernel, episode)

@@ -12,7 +12,7 @@ from dtprob.inference import PointMass
 from dtprob.inference.exact import DirichletTables
 from dtprob.models.multi_access import kernel, priors, records, window_counts
 from dtprob.models.multi_access.abduction import Transition, abduct
-from dtprob.twin.counterfactual import Arm, average_effect, transitions, what_if
+from dtprob.twin.counterfactual import Arm, Effect, average_effect, transitions, what_if
 from dtprob.twin.rollout import random_access, throughput
 from tests.small_network import CLUSTERS, simulate
 
@@ -149,3 +149,19 @@ def test_a_policy_meets_the_slots_of_the_log(posterior):
 
     slots = what_if(jax.random.key(0), SYSTEM, posterior, idle(5, 1, 3), policy=in_the_fifth, draws=40)
     assert np.asarray(slots.collision).any(axis=0).tolist() == [False, False, True, False, False]
+
+
+def test_credible_limits_are_those_of_the_average_and_not_of_few_episodes():
+    random = np.random.default_rng(0)
+    effects = random.normal(size=(4000, 1)) + 4 * random.normal(size=(4000, 4))
+    np.testing.assert_allclose(Effect(effects).interval(), (-1.645, 1.645), atol=0.25)
+
+
+@pytest.mark.parametrize("wrong", [{"horizon": 0}, {"draws": 0}, {"episodes": 1}])
+def test_an_effect_of_nothing_is_refused(posterior, wrong):
+    arm = Arm(random_access(4, 0.3))
+    settings = {"horizon": 5, "draws": 2, "episodes": 2, **wrong}
+    with pytest.raises(InputError, match=f"{next(iter(wrong))}: expected"):
+        average_effect(
+            jax.random.key(0), SYSTEM, posterior, baseline=arm, alternative=arm, metric=throughput, **settings
+        )
