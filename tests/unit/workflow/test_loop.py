@@ -249,3 +249,17 @@ def test_what_is_no_state_is_refused(case, tmp_path, content):
     (tmp_path / "state.npz").write_bytes(content)
     with pytest.raises(InputError, match="Begin without --resume"):
         load(case, tmp_path / "state.npz")
+
+
+class Scaled:
+    """A network whose one device sees its buffer as a share of the capacity."""
+
+    possible_agents = ("device_0",)
+
+    def reset(self, **_):
+        return {"device_0": np.array([0.5, 0.0, 1.0])}, {}
+
+
+def test_a_buffer_that_is_no_number_of_packets_is_refused():
+    with pytest.raises(InputError, match="observation of the physical twin: expected packets"):
+        PlayedNetwork(Scaled(), 0, 2, replay=True)
