@@ -237,9 +237,12 @@ def _optional(file: Path) -> dict[str, Any] | None:
 
 def _json(file: Path) -> dict[str, Any]:
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         reason = os.strerror(error.errno or 0)
         raise InputError(f"{file}", "a JSON file", reason, "Correct the path") from None
     except ValueError as error:
         raise InputError(f"{file}", "a JSON file", str(error), "Correct the path") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{file}", "a JSON object", type(content).__name__, "Correct the path")
+    return content

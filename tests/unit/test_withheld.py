@@ -149,6 +149,7 @@ def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeyp
         (["run", "nowhere", "--out", "out"], "folders with a case.toml each"),
         (["run", ".", "--out", "out", "--workers", "0"], "a worker or more"),
         (["score", ".", "--key", "key.json"], "No such file"),
+        (["score", ".", "--key", "list.json"], "expected a JSON object, got list"),
         (["generate", "--track", "chanel", "--count", "1", "--out", "out"], "Did you mean 'channel'?"),
         (["generate", "--track", "channel", "--count", "0", "--out", "out"], "a count from 1"),
         (["genrate"], "Did you mean 'generate'?"),
@@ -156,6 +157,7 @@ def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeyp
 )
 def test_wrong_input(words, text, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "list.json").write_text("[]")
     try:
         status = main(["withheld", *words])
     except SystemExit as stop:
