@@ -17,7 +17,7 @@ def telling() -> Generator[Say]:
         a function of one line of text; on a terminal the last line spins until the next one or the end.
     """
     start = time.monotonic()
-    if not sys.stdout.isatty():
+    if sys.stdout is None or not sys.stdout.isatty():  # None where it is closed
         yield lambda text: _tell(f"[{time.monotonic() - start:6.1f} s] {text}")
         return
     from rich.console import Console  # noqa: PLC0415  (only for terminals)

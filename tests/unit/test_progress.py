@@ -28,3 +28,9 @@ def test_the_work_goes_on_where_nobody_reads(monkeypatch):
         with telling() as say:
             say("a step")
             say("the next one")
+
+
+def test_the_work_goes_on_where_standard_output_is_closed(monkeypatch):
+    monkeypatch.setattr(sys, "stdout", None)
+    with telling() as say:
+        say("a step")
