@@ -219,14 +219,14 @@ def read_document(path: Path) -> dict[str, Any]:
     """The sections of a TOML file.
 
     Raises:
-        InputError: no such file, a folder, or not TOML.
+        InputError: no such file, a folder, one that may not be read, or not TOML.
     """
-    if path.is_dir():
-        inside = sorted(path.glob("*.toml")) or [path / "case.toml"]
-        raise InputError(str(path), "a CASE file (TOML)", "a folder", f"Name the file: {inside[0]}")
-    if not path.is_file():
-        raise InputError(str(path), "a CASE file (TOML)", "no such file", "Check the name and the folder")
     try:
+        if path.is_dir():
+            inside = sorted(path.glob("*.toml")) or [path / "case.toml"]
+            raise InputError(str(path), "a CASE file (TOML)", "a folder", f"Name the file: {inside[0]}")
+        if not path.is_file():
+            raise InputError(str(path), "a CASE file (TOML)", "no such file", "Check the name and the folder")
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except UnicodeDecodeError:
         raise InputError(
@@ -234,6 +234,9 @@ def read_document(path: Path) -> dict[str, Any]:
         ) from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(str(path), "a TOML file", str(error), "Correct the file there") from None
+    except OSError as error:
+        got = error.strerror or str(error)
+        raise InputError(str(path), "a CASE file (TOML)", got, "Check the name and the permissions") from None
 
 
 def parse_case(document: Mapping[str, Any], path: Path) -> Case:

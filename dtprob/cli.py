@@ -2,7 +2,6 @@
 
 import argparse
 import importlib
-import os
 import signal
 import sys
 import traceback
@@ -12,6 +11,7 @@ from typing import Any, NoReturn
 
 from dtprob import __version__
 from dtprob.case import load_case
+from dtprob.commands.progress import unread
 from dtprob.errors import InputError, nearest
 from dtprob.reproduce import FIGURES
 from dtprob.threads import one_thread
@@ -171,8 +171,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         resume = " Continue with the same command and --resume." if "resume" in options else ""
         return _fail(INTERRUPTED, f"stopped.{resume}", debug=debug)
-    except BrokenPipeError:  # the reader of standard output has seen enough
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    except BrokenPipeError:
+        unread()
     except InputError as error:
         return _fail(WRONG_INPUT, str(error), debug=debug)
     except Exception as error:  # noqa: BLE001  (the one place where any failure becomes one line)

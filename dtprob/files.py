@@ -7,6 +7,8 @@ from collections.abc import Generator
 from contextlib import contextmanager
 from pathlib import Path
 
+from dtprob.errors import InputError
+
 
 @contextmanager
 def atomic_write(path: str | os.PathLike[str]) -> Generator[Path]:
@@ -38,6 +40,20 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
     """Write text to a file, whole or not at all."""
     with atomic_write(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
+
+
+def make_folder(out: Path) -> None:
+    """Make the folder of the results, before work that would be lost without it.
+
+    Raises:
+        InputError: a file of that name, or no permission.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"--out {out}", "a folder", error.strerror or str(error), "Choose another folder"
+        ) from None
 
 
 def sha256(path: Path) -> str:

@@ -79,18 +79,32 @@ def _find(name: str) -> object:
         return None
 
 
-def _forget(top: str, folder: Path) -> None:
-    """Drop a module of the same name that was loaded from another folder."""
-    loaded = sys.modules.get(top)
-    if loaded is not None and not _lies_in(loaded, folder):
+def _forget(named: str, folder: Path) -> None:
+    """Drop modules that another folder's took the names of: the one named, and those that it may import from beside."""
+    beside = {file.stem for file in folder.glob("*.py")} | {
+        file.parent.name for file in folder.glob("*/__init__.py")
+    }
+    for top in beside:
+        loaded = sys.modules.get(top)
+        if loaded is None or _lies_in(loaded, folder) or (top != named and _is_installed(loaded)):
+            continue
         for name in [entry for entry in sys.modules if entry == top or entry.startswith(f"{top}.")]:
             del sys.modules[name]
     importlib.invalidate_caches()
 
 
+def _is_installed(module: ModuleType) -> bool:
+    """Whether a module is Python's own or a package's, and not one beside another CASE."""
+    return not _places(module) or any(_lies_in(module, Path(own)) for own in (sys.prefix, sys.base_prefix))
+
+
 def _lies_in(module: ModuleType, folder: Path) -> bool:
+    return any(Path(place).is_relative_to(folder) for place in _places(module))
+
+
+def _places(module: ModuleType) -> list[str]:
     places = [getattr(module, "__file__", None) or "", *getattr(module, "__path__", [])]
-    return any(Path(place).is_relative_to(folder) for place in places if place)
+    return [place for place in places if place]
 
 
 @contextmanager

@@ -18,8 +18,14 @@ def keep_compiled() -> None:
     """Keep compiled programs in the user's cache folder; JAX_COMPILATION_CACHE_DIR names another one."""
     if jax.config.jax_compilation_cache_dir is not None:
         return
-    folder = cache_folder()
-    prune(folder, LARGEST)
+    try:
+        folder = cache_folder()
+        prune(folder, LARGEST)
+    except (
+        OSError,
+        RuntimeError,
+    ):  # no home, or a folder of another user: compiling again takes time, and no more
+        return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # even small programs: reading one back takes a tenth of compiling it
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

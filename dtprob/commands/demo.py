@@ -6,6 +6,7 @@ from pathlib import Path
 
 from dtprob.case import load_case
 from dtprob.commands import diagnose
+from dtprob.files import make_folder
 
 FILES = ("case.toml", "channels.npz", "paths.nc", "truth.json")
 
@@ -17,7 +18,7 @@ def run(out: Path) -> None:
         out: the folder of the results.
     """
     folder = out / "case"
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     for name in FILES:
         with resources.as_file(resources.files("dtprob.data") / "demo" / name) as file:
             shutil.copyfile(file, folder / name)

@@ -1,5 +1,6 @@
 """Telling a person how far a command is: a live line on a terminal, plain lines elsewhere."""
 
+import os
 import sys
 import time
 from collections.abc import Callable, Generator
@@ -16,16 +17,31 @@ def telling() -> Generator[Say]:
         a function of one line of text; on a terminal the last line spins until the next one or the end.
     """
     start = time.monotonic()
-    if not sys.stdout.isatty():
-        yield lambda text: print(f"[{time.monotonic() - start:6.1f} s] {text}", flush=True)
+    if sys.stdout is None or not sys.stdout.isatty():  # None where it is closed
+        yield lambda text: _tell(f"[{time.monotonic() - start:6.1f} s] {text}")
         return
     from rich.console import Console  # noqa: PLC0415  (only for terminals)
+    from rich.markup import escape  # noqa: PLC0415
 
     console = Console()
     with console.status("starting") as status:
 
         def say(text: str) -> None:
-            console.print(f"[dim]{time.monotonic() - start:6.1f} s[/dim] {text}", highlight=False)
-            status.update(text)
+            plain = escape(text)  # names such as effect[device_1] are no markup
+            console.print(f"[dim]{time.monotonic() - start:6.1f} s[/dim] {plain}", highlight=False)
+            status.update(plain)
 
         yield say
+
+
+def unread() -> None:
+    """Write what is still said on standard output nowhere: its reader has seen enough."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+
+
+def _tell(text: str) -> None:
+    """Print a line; the work goes on where nobody reads it."""
+    try:
+        print(text, flush=True)
+    except BrokenPipeError:
+        unread()

@@ -10,6 +10,7 @@ import jax
 from dtprob.commands.run import session
 from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
+from dtprob.files import make_folder
 from dtprob.reproduce import FIGURES
 from dtprob.reproduce.figure import write
 from dtprob.reproduce.progress import Progress
@@ -33,6 +34,7 @@ def run(figure: str, out: Path, *, runs: int | None, seed: int, resume: bool) ->
     if (runs is not None and runs < 1) or seed < 0:
         got = f"runs {runs}, seed {seed}"
         raise InputError("reproduce", "runs from 1 and a seed from 0", got, "Correct them")
+    make_folder(out)
     with session() as say:
         module = importlib.import_module(FIGURES[figure])
         count = module.RUNS if runs is None else runs

@@ -14,7 +14,7 @@ from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
 from dtprob.errors import InputError
-from dtprob.files import sha256, write_text
+from dtprob.files import make_folder, sha256, write_text
 from dtprob.inference import LATENTS_ONLY, Posterior, RunOptions
 from dtprob.workflow import Prepared, prepare
 
@@ -77,7 +77,7 @@ def prepare_case(case: Case, run: Run, need: Literal["fit", "diagnosis"], result
     """
     if case.user_code and run.allow_code:
         run.say(f"this case runs code of its own: {', '.join(case.user_code)}")
-    _make_folder(run.out)
+    make_folder(run.out)
     prepared = prepare(case, need=need, allow_code=run.allow_code, cache=run.out, say=run.say)
     for name in results:
         (run.out / name).unlink(missing_ok=True)
@@ -112,6 +112,8 @@ def infer(
         checkpoint=checkpoint,
         resume=resume,
     )
+    for earlier in (identity, file):  # what breaks off leaves no posterior of another run
+        earlier.unlink(missing_ok=True)
     run.say(f"fitting with {prepared.engine.name}")
     posterior = prepared.engine(prepared.key, prepared.model, data, options=options)
     posterior.save(file)
@@ -131,12 +133,3 @@ def _identity(prepared: Prepared, file: Path) -> str:
 
 def _read(file: Path) -> str | None:
     return file.read_text(encoding="utf-8") if file.is_file() else None
-
-
-def _make_folder(out: Path) -> None:
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(
-            f"--out {out}", "a folder", error.strerror or str(error), "Choose another folder"
-        ) from None

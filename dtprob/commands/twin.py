@@ -12,7 +12,7 @@ from dtprob.commands.run import session
 from dtprob.control import TablePolicy, export
 from dtprob.data import NetworkLog, write
 from dtprob.errors import InputError
-from dtprob.files import write_text
+from dtprob.files import make_folder, write_text
 from dtprob.workflow.loop import (
     State,
     Twin,
@@ -54,6 +54,7 @@ def run(twin_case: Path, out: Path, *, seed: int | None, no_code: bool, resume: 
         if seed < 0:
             raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
         case = replace(case, seed=replace(case.seed, value=seed))
+    make_folder(out)
     with session() as say, jax.enable_x64(False):
         if case.user_code and not no_code:
             say(f"this case runs code of its own: {', '.join(case.user_code)}")
@@ -62,6 +63,7 @@ def run(twin_case: Path, out: Path, *, seed: int | None, no_code: bool, resume: 
         if state.slots:
             twin.physical.go_on(state.rows)
             say(f"going on in round {state.round} at slot {state.slots}: {state.phase}")
+            _write(case, state, out)  # the run may have ended between the state and what people read of it
         while not finished(state):
             state = advance(twin, state)
             _write(case, state, out)

@@ -16,7 +16,7 @@ from pebble import ProcessExpired, ProcessPool
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
-from dtprob.files import sha256, write_text
+from dtprob.files import make_folder, sha256, write_text
 
 TRACKS: Final = {
     "channel": "dtprob.physical.cases",
@@ -53,6 +53,7 @@ def generate(
     if count < 1 or seed < 0:
         got = f"count {count}, seed {seed}"
         raise InputError("withheld generate", "a count from 1 and a seed from 0", got, "Correct them")
+    make_folder(out)
     from dtprob.commands.run import session  # noqa: PLC0415  (heavy)
 
     with session() as say:
@@ -89,7 +90,7 @@ def run(
         resume: keep the answers that are there, where case, seed and dtprob's own code are what they were.
 
     Raises:
-        InputError: no cases, or a number of workers below 1.
+        InputError: no cases, a number of workers below 1, a seed below 0, or answers that are no folder.
         RuntimeError: some cases could not be diagnosed; why lies in OUT/NAME/error.txt.
     """
     found = sorted(path.parent.name for path in cases.glob("*/case.toml"))
@@ -98,6 +99,9 @@ def run(
         raise InputError(
             f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
         )
+    if seed is not None and seed < 0:
+        raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
+    make_folder(out)
     wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
     jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in found]
     jobs = [job for job in jobs if any(not job.keeps(file) for file in wanted)]
@@ -213,7 +217,8 @@ def _diagnose(job: _Job) -> str | None:
     answers = {"report.json": answer, "rivals.json": answer_of_rivals}
     job.folder.mkdir(parents=True, exist_ok=True)
     todo = [file for file in job.wanted if not job.keeps(file)]
-    for file in todo if job.is_same else (*answers, "timing.json"):
+    gone = todo if job.is_same else (*answers, "timing.json")
+    for file in (*gone, "error.txt"):
         (job.folder / file).unlink(missing_ok=True)  # what breaks off has no answer, not an older one
     write_text(job.folder / _IDENTITY, job.identity)
     try:
@@ -232,9 +237,12 @@ def _optional(file: Path) -> dict[str, Any] | None:
 
 def _json(file: Path) -> dict[str, Any]:
     try:
-        return json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(file.read_text(encoding="utf-8"))
     except OSError as error:
         reason = os.strerror(error.errno or 0)
         raise InputError(f"{file}", "a JSON file", reason, "Correct the path") from None
     except ValueError as error:
         raise InputError(f"{file}", "a JSON file", str(error), "Correct the path") from None
+    if not isinstance(content, dict):
+        raise InputError(f"{file}", "a JSON object", type(content).__name__, "Correct the path")
+    return content

@@ -40,9 +40,9 @@ class COMA:
         scale: reward that counts as one.
         frame: slots of the frame whose phase the critic sees.
         capacity: packets that a buffer holds.
-        caution: how much more the environments count whose parameters pay less, per unit of reward and slot; 0 is the
-            plain mean. What is maximised is the entropic risk over the draws; a point estimate has one draw, and
-            nothing to be cautious about.
+        caution: how much more the environments count that paid less between two updates, per unit of reward and slot;
+            0 is the plain mean. What is maximised is the entropic risk over draws and luck together; a point estimate
+            has one draw, and only luck to be cautious about.
     """
 
     actor_rate: float = 5e-3

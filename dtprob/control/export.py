@@ -1,6 +1,7 @@
 """Policies as files that a device can run: a table of chances in JSON, the weights of a recurrent network in NPZ."""
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any, Final
 
@@ -64,7 +65,7 @@ def load(path: Path) -> TablePolicy | HistoryPolicy:
     """
     try:
         return _recurrent(path) if path.suffix == ".npz" else _table(path)
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, EOFError, ValueError, KeyError, TypeError, zipfile.BadZipFile) as error:
         raise InputError(str(path), "a policy", type(error).__name__, "Write it with save") from error
 
 
@@ -79,7 +80,7 @@ def _table(path: Path) -> TablePolicy:
 
 
 def _recurrent(path: Path) -> HistoryPolicy:
-    with np.load(path, allow_pickle=False) as stored:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
         arrays = {name: stored[name] for name in (*_WEIGHTS, "format", "frame")}
     devices, _, width = arrays["cell_hidden"].shape
     policy = HistoryPolicy(jax.random.key(0), devices, int(arrays["frame"]), width)

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from dtprob.control.environment import Environment
 from dtprob.control.policy import Memory, Policy
 from dtprob.control.rollout import Play, Trajectory, begin, play
+from dtprob.errors import InputError
 
 
 class Learner(Protocol):
@@ -43,7 +44,7 @@ class Budget(NamedTuple):
     Attributes:
         slots: in all, over all environments.
         environments: that are played side by side.
-        length: slots between two updates.
+        length: slots between two updates, 2 or more: what follows the last one is a guess.
     """
 
     slots: int = 120_000
@@ -79,7 +80,13 @@ def train(
         policy: to start from.
         environment: the twin, or the truth; each episode takes parameters from its pool, or more often.
         budget: how much is played.
+
+    Raises:
+        InputError: a budget without an environment, or with too few slots between two updates to learn from.
     """
+    for name, value, least in (("environments", budget.environments, 1), ("length", budget.length, 2)):
+        if value < least:
+            raise InputError(f"budget: {name}", f"{least} or more", str(value), "Give a larger number")
     first, second, third = jax.random.split(key, 3)
     kept = learner.start(first, policy)
     now = begin(second, environment, policy, budget.environments)

@@ -68,9 +68,9 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
         self._key, key = jax.random.split(self._key)
         self._state, self._seen = self._start(key)
         self.agents = list(self.possible_agents)
-        for agent in self.agents:
-            if seed is not None:
-                self.action_spaces[agent].seed(seed)
+        for number, agent in enumerate(self.agents):
+            if seed is not None:  # each its own, or all devices would sample the same actions
+                self.action_spaces[agent].seed(seed + number)
         return _seen(self.agents, self._seen), {agent: {} for agent in self.agents}
 
     def step(

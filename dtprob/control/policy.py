@@ -8,6 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dtprob.control.environment import Observation
+from dtprob.errors import InputError
 
 type Memory = Float[Array, "device size"]
 
@@ -138,11 +139,17 @@ def tdma(devices: int, capacity: int, frame: list[list[int]]) -> TablePolicy:
     Args:
         devices: how many.
         capacity: packets that a buffer holds.
-        frame: for each slot of the frame, the devices that send in it.
+        frame: for each slot of the frame, the devices that send in it, if any.
+
+    Raises:
+        InputError: a device that there is not.
     """
     table = jnp.zeros((len(frame), devices, capacity + 1, 2, 2))
     for phase, members in enumerate(frame):
-        table = table.at[phase, jnp.array(members)].set(1.0)
+        if not set(members) <= set(range(devices)):
+            expected, got = f"devices from 0 to {devices - 1}", f"{members} in slot {phase}"
+            raise InputError("frame", expected, got, "Number the devices from 0")
+        table = table.at[phase, jnp.array(members, jnp.int32)].set(1.0)
     return TablePolicy(table)
 
 

@@ -20,7 +20,7 @@ from dtprob.errors import InputError
 from dtprob.inference.posterior import Sampler
 from dtprob.models.multi_access.abduction import Transition, abduct
 from dtprob.models.multi_access.transition import Kernel, State
-from dtprob.twin.predict import sampled
+from dtprob.twin.predict import Prediction, check_counts, sampled
 from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, rollout
 
 SITES = ("log_arrival", "log_reception")
@@ -62,12 +62,11 @@ class Effect:
         return float(self.differences.mean())
 
     def interval(self, level: float = 0.9) -> tuple[float, float]:
-        """Credible limits of the average treatment effect, over draws of the parameters."""
-        if not 0 < level < 1:
-            raise InputError("level of an interval", "between 0 and 1", f"{level:g}", "Correct it")
-        tail = (1 - level) / 2
-        low, high = np.quantile(self.differences.mean(axis=1), [tail, 1 - tail])
-        return float(low), float(high)
+        """Credible limits of the average treatment effect, over draws of the parameters.
+
+        They are freed of the noise of few episodes, as those of an expected metric are.
+        """
+        return Prediction(self.differences).expected_interval(level)
 
 
 def average_effect(
@@ -98,8 +97,9 @@ def average_effect(
         sites: the parameters that the kernel takes.
 
     Raises:
-        InputError: the sampler lacks a site.
+        InputError: counts below 1, fewer than 2 episodes, or a sampler that lacks a site.
     """
+    check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
 
@@ -148,6 +148,8 @@ class LogLike(Protocol):
 def transitions(episode: LogLike) -> Transition:
     """The slots of one logged episode, each field (slot, device); nothing arrived before the first.
 
+    They are numbered as in the log where it numbers them, else from 0.
+
     Raises:
         InputError: slots of several episodes.
     """
@@ -158,7 +160,7 @@ def transitions(episode: LogLike) -> Transition:
         )
     arrival, ack = (jnp.asarray(x, jnp.int32) for x in (episode.arrival, episode.ack))
     last_arrival, last_ack = (jnp.concatenate([jnp.zeros_like(x[:1]), x[:-1]]) for x in (arrival, ack))
-    slot = jnp.arange(len(arrival), dtype=jnp.int32)
+    slot = jnp.asarray(getattr(episode, "slot", np.arange(len(arrival))), jnp.int32)
     state = State(jnp.asarray(episode.buffer, jnp.int32), last_arrival, last_ack, slot)
     return Transition(state, jnp.asarray(episode.action, jnp.int32), ack, arrival)
 
@@ -191,10 +193,12 @@ def what_if(
         The slots, each field (draw, slot, ...).
 
     Raises:
-        InputError: an episode that could not happen under a draw of the parameters.
+        InputError: no draws, an episode of another network, or one that could not happen under a draw of the parameters.
     """
+    check_counts({"draws": (draws, 1)})
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, SITES)
     happened = transitions(episode)
+    _check_buffers(kernel, episode)
 
     keys = jax.random.split(jax.random.fold_in(key, 1), draws)
     slots, could = _replayed(keys, happened, parameters, kernel, policy, change=change)
@@ -203,6 +207,21 @@ def what_if(
         remedy = "Learn the parameters from this log too"
         raise InputError("episode", "slots that can happen", f"slot {slot} under draw {draw}", remedy)
     return slots
+
+
+def _check_buffers(kernel: Kernel, episode: LogLike) -> None:
+    """Refuse a log whose buffers are not those that the network would have had."""
+    remedy = "Give the network that was logged"
+    found = episode.buffer.shape[1]
+    if found != kernel.devices:
+        raise InputError("episode", f"{kernel.devices} devices, as in the network", str(found), remedy)
+    after = np.clip(episode.buffer + episode.arrival - episode.ack, 0, kernel.capacity)
+    expected = np.concatenate([np.minimum(episode.buffer[:1], kernel.capacity), after[:-1]])
+    if not np.array_equal(expected, episode.buffer):
+        slot, device = (int(i) for i in np.argwhere(expected != episode.buffer)[0])
+        wanted = f"{expected[slot, device]} packets, as capacity {kernel.capacity} leaves"
+        got = f"{episode.buffer[slot, device]} in its slot {slot}"
+        raise InputError(f"episode, buffer_{device}", wanted, got, remedy)
 
 
 @eqx.filter_jit

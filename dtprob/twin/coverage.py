@@ -47,7 +47,13 @@ class CoverageMap:
 
         Args:
             probability: that the interval holds the power.
+
+        Raises:
+            InputError: a probability outside of (0, 1).
         """
+        if not 0 < probability < 1:
+            got = f"{probability:g}"
+            raise InputError("probability of an interval", "between 0 and 1", got, "Correct it")
         low, high = np.quantile(self.power, [0.5 - probability / 2, 0.5 + probability / 2], axis=0)
         return low, high
 

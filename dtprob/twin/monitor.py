@@ -75,7 +75,7 @@ class Monitor:
         run_length: mean windows to a false alarm of the sequential detector.
 
     Raises:
-        InputError: an unknown statistic, or evidence without `changed`.
+        InputError: an unknown statistic, evidence without `changed`, or a run length below 1.
     """
 
     model: Model
@@ -94,6 +94,9 @@ class Monitor:
         if self.statistic == "evidence" and self.changed is None:
             remedy = "Sample the model's prior"
             raise InputError("monitor by evidence", "draws of what a change may bring", "none", remedy)
+        if not self.run_length >= 1:
+            got, remedy = f"{self.run_length:g}", "Give a larger number"
+            raise InputError("run length of a monitor", "1 window or more", got, remedy)
 
     def calibrated(self, data: Data) -> Monitor:
         """The monitor with its threshold set by normal windows that it has not learned from.

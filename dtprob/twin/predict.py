@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import final
 
@@ -95,9 +96,7 @@ def predict(
     Raises:
         InputError: counts below 1, fewer than 2 episodes, or a sampler that lacks a site.
     """
-    for name, value, least in (("horizon", horizon, 1), ("draws", draws, 1), ("episodes", episodes, 2)):
-        if value < least:
-            raise InputError(name, f"{least} or more", str(value), f"Give a larger {name}")
+    check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
     return Prediction(np.asarray(_values(keys, parameters, kernel, policy, metric, horizon=horizon), float))
@@ -127,6 +126,17 @@ def sampled(key: PRNGKeyArray, sampler: Sampler, draws: int, sites: tuple[str, .
             remedy = "Take a posterior of the model that the kernel belongs to"
             raise InputError("sampler", f"draws of {site!r}", f"of {', '.join(found)}", remedy)
     return {site: jnp.asarray(found[site]) for site in sites}
+
+
+def check_counts(counts: Mapping[str, tuple[int, int]]) -> None:
+    """Refuse counts that are too small; each with the least that it can be.
+
+    Raises:
+        InputError: one below it.
+    """
+    for name, (value, least) in counts.items():
+        if value < least:
+            raise InputError(name, f"{least} or more", str(value), f"Give a larger {name}")
 
 
 def _checked(level: float) -> float:

@@ -112,8 +112,15 @@ def blame(evidence: Mapping[str, Float[np.ndarray, " window"]]) -> dict[str, flo
 
 
 def shares(evidence: Mapping[str, float]) -> dict[str, float]:
-    """Probabilities of alternatives that were alike before, from the log evidence of each."""
-    weight = special.softmax(np.array(list(evidence.values())))
+    """Probabilities of alternatives that were alike before, from the log evidence of each.
+
+    Those whose evidence has no bound share all of it; where every one is impossible, none stands out.
+    """
+    if not evidence:
+        return {}
+    values = np.array(list(evidence.values()))
+    top = values.max()
+    weight = special.softmax(values) if np.isfinite(top) else (values == top) / np.sum(values == top)
     return dict(zip(evidence, map(float, weight), strict=True))
 
 

@@ -16,6 +16,7 @@ from jaxtyping import Float
 from dtprob.case import Case, SceneSection
 from dtprob.data import ChannelData, PowerData
 from dtprob.data.location import located
+from dtprob.edition import edition
 from dtprob.effects.mistaken import place_name
 from dtprob.effects.solver import DEPTH, REFRACTION
 from dtprob.errors import InputError
@@ -200,8 +201,8 @@ class _Traced(NamedTuple):
 
 
 def _scene_hash(scene: SceneSection, data: ChannelData | PowerData) -> str:
-    """What a traced path set depends on, in 16 characters."""
-    digest = hashlib.sha256(json.dumps(dataclasses.asdict(scene), sort_keys=True).encode())
+    """What a traced path set depends on, the state of dtprob's own code too, in 16 characters."""
+    digest = hashlib.sha256(json.dumps([edition(), dataclasses.asdict(scene)], sort_keys=True).encode())
     for file in scene_files(scene):
         digest.update(file.read_bytes())
     for positions in (data.tx_position, data.rx_position):

@@ -1,6 +1,9 @@
 """Compiled programs are kept where the user's cache lies, and the oldest go when there are too many."""
 
 import os
+from types import SimpleNamespace
+
+import pytest
 
 from dtprob.commands import cache
 
@@ -35,3 +38,13 @@ def test_a_file_that_another_process_deletes_meanwhile_is_no_error(tmp_path, mon
     monkeypatch.setattr(os, "scandir", lambda _: entries)
     cache.prune(tmp_path, 50)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("error", [PermissionError("of another user"), RuntimeError("no home")])
+def test_a_folder_that_cannot_be_used_stops_no_command(monkeypatch, error):
+    def missing():
+        raise error
+
+    monkeypatch.setattr(cache, "cache_folder", missing)
+    monkeypatch.setattr(cache, "jax", SimpleNamespace(config=SimpleNamespace(jax_compilation_cache_dir=None)))
+    cache.keep_compiled()

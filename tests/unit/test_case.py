@@ -206,3 +206,18 @@ def test_mistakes_in_own_modules_are_named(tmp_path):
     }.items():
         with pytest.raises(InputError, match=message):
             load_object(name, tmp_path)
+
+
+def test_a_file_that_cannot_be_looked_at(tmp_path):
+    with pytest.raises(InputError, match=r"expected a CASE file \(TOML\), got File name too long"):
+        load_case(tmp_path / f"{'a' * 300}.toml")
+
+
+def test_what_own_modules_import_is_from_beside_the_same_case(tmp_path):
+    """In a process that meets one case after the other."""
+    for name in ("one", "other"):
+        folder = tmp_path / name
+        folder.mkdir()
+        (folder / "own_model_here.py").write_text("from own_helper_here import NAME\n")
+        (folder / "own_helper_here.py").write_text(f"NAME = {name!r}\n")
+        assert load_object("own_model_here:NAME", folder) == name

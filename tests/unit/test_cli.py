@@ -54,6 +54,9 @@ name = "laplace"
 """
 
 
+EXAMPLE = str(Path(__file__).parents[2] / "examples" / "network" / "twin.toml")
+
+
 @pytest.fixture
 def case(tmp_path) -> Path:
     rng = np.random.default_rng(0)
@@ -225,6 +228,21 @@ def test_out_that_is_a_file(case, capsys, tmp_path):
     assert "expected a folder" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("demo",),
+        ("reproduce", "fig2"),
+        ("twin", "run", EXAMPLE),
+        ("withheld", "generate", "--track", "custom", "--count", "1"),
+    ],
+)
+def test_out_that_is_a_file_is_said_before_any_work(words, capsys, tmp_path):
+    (tmp_path / "out").write_text("")
+    assert main([*words, "--out", str(tmp_path / "out")]) == 2
+    assert "expected a folder" in capsys.readouterr().err
+
+
 def test_fit_writes_a_posterior_and_its_summary(case, capsys, tmp_path):
     from dtprob.inference import Posterior
 
@@ -304,7 +322,7 @@ def test_a_failed_run_leaves_no_results_of_an_earlier_one(case, tmp_path):
     (tmp_path / "broken_model.py").write_text(MODEL.replace("slope * x", "slope * x / undefined"))
     change(case, "line_model", "broken_model")
     assert main(["fit", str(case), "--out", str(out)]) == 1
-    assert not (out / "summary.json").exists()
+    assert not any((out / name).exists() for name in ("summary.json", "posterior.nc", "posterior.identity"))
 
 
 def test_list(capsys):

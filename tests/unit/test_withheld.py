@@ -149,6 +149,7 @@ def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeyp
         (["run", "nowhere", "--out", "out"], "folders with a case.toml each"),
         (["run", ".", "--out", "out", "--workers", "0"], "a worker or more"),
         (["score", ".", "--key", "key.json"], "No such file"),
+        (["score", ".", "--key", "list.json"], "expected a JSON object, got list"),
         (["generate", "--track", "chanel", "--count", "1", "--out", "out"], "Did you mean 'channel'?"),
         (["generate", "--track", "channel", "--count", "0", "--out", "out"], "a count from 1"),
         (["genrate"], "Did you mean 'generate'?"),
@@ -156,9 +157,43 @@ def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeyp
 )
 def test_wrong_input(words, text, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "list.json").write_text("[]")
     try:
         status = main(["withheld", *words])
     except SystemExit as stop:
         status = stop.code
     assert status == 2
     assert text in capsys.readouterr().err
+
+
+def _one_case(folder):
+    """A case whose answer, and whose failure before, are there."""
+    own, answer = folder / "cases" / "a", folder / "answers" / "a"
+    own.mkdir(parents=True)
+    answer.mkdir(parents=True)
+    (own / "case.toml").write_text(CASE)
+    (answer / "report.json").write_text("{}")
+    (answer / "error.txt").write_text("why it failed before")
+    return own, answer
+
+
+def test_a_wrong_seed_costs_no_answers(tmp_path, capsys):
+    own, answer = _one_case(tmp_path)
+    words = ["withheld", "run", str(own.parent), "--out", str(answer.parent), "--seed", "-1"]
+    assert main(words) == 2
+    assert "--seed: expected a whole number from 0, got -1" in capsys.readouterr().err
+    assert (answer / "report.json").is_file()
+
+
+def test_a_case_that_breaks_off_keeps_no_older_failure(tmp_path, monkeypatch):
+    """A score would count that failure, though this run has not ended."""
+    own, answer = _one_case(tmp_path)
+
+    def killed(path):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dtprob.case.load_case", killed)
+    job = withheld._Job(own, answer, ("report.json",), seed=None, no_code=False, resume=False)
+    with pytest.raises(KeyboardInterrupt):
+        withheld._diagnose(job)
+    assert {entry.name for entry in answer.iterdir()} == {"identity.txt"}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -34,7 +35,9 @@ def records(
     Raises:
         InputError: devices in the log and in the clusters that do not match, a window below 1, or a buffer that the
             capacity does not allow.
+        TypeError: a window or capacity that is no whole number.
     """
+    window, capacity = operator.index(window), operator.index(capacity)
     known = Clusters(tuple(tuple(cluster) for cluster in clusters))
     devices = log.buffer.shape[1]
     if known.devices != devices:

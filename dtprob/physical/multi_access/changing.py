@@ -74,8 +74,8 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
         del options
         if seed is not None:
             self._random, self._total = np.random.default_rng(seed), 0
-            for agent in self.possible_agents:
-                self.action_spaces[agent].seed(seed)
+            for number, agent in enumerate(self.possible_agents):  # each its own, or all would sample alike
+                self.action_spaces[agent].seed(seed + number)
         self.agents = list(self.possible_agents)
         self._seen, self._begun = np.zeros_like(self._seen), True
         return self._shown(self.agents), {agent: {} for agent in self.agents}

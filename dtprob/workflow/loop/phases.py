@@ -176,7 +176,7 @@ def _key(case: TwinCase, state: State) -> PRNGKeyArray:
 
 
 def _budget(slots: int, length: int) -> Budget:
-    return Budget(slots, length=length)
+    return Budget(slots, length=max(length, 2))
 
 
 def _played(twin: Twin, state: State, policy: Chances, slots: int) -> State:

@@ -104,6 +104,7 @@ class PlayedNetwork:
 
     def __init__(self, environment: Any, seed: int, capacity: int, *, replay: bool) -> None:
         self._environment, self._capacity, self._replay = environment, capacity, replay
+        self._seed = seed
         self._agents: list[str] = list(environment.possible_agents)
         self._episode, self._slot = 0, 0
         self._seen = self._read(environment.reset(seed=seed)[0])
@@ -121,6 +122,8 @@ class PlayedNetwork:
         """See `Physical`."""
         if not self._replay:
             self._episode = int(rows["episode"][-1]) + 1 if len(rows["episode"]) else 0
+            # another seed, or an environment that heeds it would have the same luck as in the first slots
+            self._seen = self._read(self._environment.reset(seed=self._seed + len(rows["episode"]))[0])
             return
         again = _columns([self._step(action) for action in rows["action"]], len(self._agents))
         _check_same(again, rows, "Set replay = false in [physical] where luck cannot be repeated")
@@ -142,6 +145,9 @@ class PlayedNetwork:
         try:
             table = np.stack([np.asarray(seen[agent]).reshape(-1)[:3] for agent in self._agents])
             valid = table.shape[1] == 3 and np.all((table >= 0) & (table <= [self._capacity, 1, 1]))
+            valid = valid and np.all(
+                table == np.round(table)
+            )  # a share of the capacity is no number of packets
         except (KeyError, ValueError, TypeError) as error:
             table, valid = repr(error), False
         if not valid or isinstance(table, str):

@@ -6,11 +6,19 @@ from pathlib import Path
 from typing import Any, Final, final
 
 from dtprob.case import EffectsSection, ModelSection, Options, SeedSection, parse_sections, read_document
-from dtprob.errors import InputError
+from dtprob.effects import summaries
+from dtprob.effects.network import FAMILIES
+from dtprob.errors import InputError, unknown_name
 from dtprob.models.multi_access import Clusters, Kernel
 
 MODEL: Final = "multi_access"
 OPTIONS: Final = ("clusters", "capacity", "traffic", "concentration")
+_PLAIN: Final[Mapping[str, tuple[str, tuple[type, ...]]]] = {
+    "capacity": ("a whole number", (int,)),
+    "traffic": ("text", (str,)),
+    "concentration": ("a number", (int, float)),
+}
+"""What an option is in words, and its types."""
 
 
 @final
@@ -129,6 +137,7 @@ def load_twin_case(path: Path) -> TwinCase:
             raise InputError(path.name, f"a section [{name}]", "none", f"Add [{name}] with at least '{key}'")
     case = TwinCase(path=path.absolute(), **sections)
     _check_model(case)
+    _check_effects(case)
     physical = case.physical
     if (physical.environment is None) == (physical.log is None):
         got = "neither" if physical.log is None else "both"
@@ -147,6 +156,9 @@ def _check_model(case: TwinCase) -> None:
             raise InputError(f"{where} options", f"keys among {', '.join(OPTIONS)}", name, "Correct the key")
     if "clusters" not in options:
         raise InputError(f"{where} options", "a key 'clusters'", "none", "Add clusters = [[0, 1], ...]")
+    for name, (expected, kinds) in _PLAIN.items():
+        if name in options and type(options[name]) not in kinds:
+            raise InputError(f"{where} options {name}", expected, repr(options[name]), "Correct the value")
     if options.get("traffic", "memoryless") not in {"memoryless", "markov"}:
         got = str(options["traffic"])
         raise InputError(f"{where} options traffic", "memoryless or markov", got, "Correct the value")
@@ -154,8 +166,23 @@ def _check_model(case: TwinCase) -> None:
         kernel, concentration = case.kernel, case.concentration
     except (TypeError, ValueError) as error:
         raise InputError(f"{where} options", "values of the right type", str(error), "Correct them") from None
-    if kernel.capacity < 1 or not concentration > 0:
+    if kernel.capacity < 1 or not 0 < concentration < float("inf"):
         got = f"capacity {kernel.capacity}, concentration {concentration}"
         raise InputError(
             f"{where} options", "a capacity from 1, a concentration above 0", got, "Correct them"
+        )
+
+
+def _check_effects(case: TwinCase) -> None:
+    """Refuse what a diagnosis would refuse only after an alarm, when another case cannot go on with the slots."""
+    where, chosen = f"{case.path.name} [effects]", case.effects
+    use = chosen.use if isinstance(chosen.use, tuple) else () if chosen.use == "all" else (chosen.use,)
+    for key, names, valid in (("use", use, FAMILIES), ("exclude", chosen.exclude, summaries())):
+        for name in names:
+            if name.partition("[")[0] not in valid:
+                raise unknown_name(f"{where} {key}", name, valid, "effect family")
+    if chosen.known:
+        got = ", ".join(chosen.known)
+        raise InputError(
+            f"{where} known", "nothing, since a running twin has no effects", got, "Leave it out"
         )

@@ -1,6 +1,7 @@
 """Where a loop stands, as one file that is there whole or not at all."""
 
 import json
+import zipfile
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -85,10 +86,10 @@ def load(case: TwinCase, path: Path) -> State:
         InputError: a file of another case or version, or none of a loop.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = dict(stored)
         identity, plain = str(arrays.pop("identity")), json.loads(str(arrays.pop("plain")))
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
         raise InputError(
             str(path), "a loop's state", type(error).__name__, "Begin without --resume"
         ) from None

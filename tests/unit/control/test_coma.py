@@ -15,6 +15,7 @@ from dtprob.control.critic import CentralCritic
 from dtprob.control.environment import Observation
 from dtprob.control.returns import counterfactual_advantage, lambda_returns
 from dtprob.control.rollout import Trajectory, begin, play
+from dtprob.errors import InputError
 from dtprob.physical.multi_access import aloha, average, chain
 from tests.unit.control.networks import PAIR, world
 
@@ -170,3 +171,9 @@ def test_caution_counts_more_what_pays_less():
     weight = np.asarray(COMA(caution=2.0, scale=10.0).weight(played), float)
     assert weight.mean() == pytest.approx(1.0)
     np.testing.assert_allclose(weight[0] / weight[1:], np.exp([2.0, -12.0]), rtol=1e-5)
+
+
+def test_a_budget_that_teaches_nothing_is_refused():
+    """The return of a trajectory's last slot is a guess: with one slot between two updates nothing would be learned."""
+    with pytest.raises(InputError, match="length: expected 2 or more, got 1"):
+        train(KEY, COMA(), FramePolicy(KEY, 2), world(PAIR), Budget(100, 4, 1))

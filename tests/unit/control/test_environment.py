@@ -118,3 +118,10 @@ def test_pettingzoo_truncates_and_shows_the_final_observation():
         assert np.array_equal(network.state(), np.stack(list(seen.values())))
     assert network.agents == []
     assert network.step({}) == ({}, {}, {}, {}, {})
+
+
+def test_devices_sample_actions_of_their_own():
+    network = ParallelNetwork(world(NETWORK, horizon=3))
+    network.reset(seed=1)
+    spaces = [network.action_space(agent) for agent in network.agents]
+    assert len({tuple(space.sample() for _ in range(40)) for space in spaces}) == 4

@@ -69,6 +69,14 @@ def test_fixed_rules_deliver_what_the_exact_averages_say():
             assert abs(np.mean(value) - law) < error
 
 
+def test_a_frame_may_have_silent_slots_and_no_strangers():
+    table = np.asarray(tdma(3, 1, [[0, 2], []]).probability)
+    assert table[0, :, 1, 0, 0].tolist() == [1.0, 0.0, 1.0]
+    assert not table[1].any()
+    with pytest.raises(InputError, match=r"devices from 0 to 2, got \[3\] in slot 1"):
+        tdma(3, 1, [[0], [3]])
+
+
 def test_a_table_sends_as_the_network_it_was_made_from(tmp_path):
     policy = FramePolicy(KEY, 4)
     save(tabulate(policy), tmp_path / "policy.json")
@@ -116,9 +124,10 @@ def test_a_recurrent_policy_runs_on_a_device_as_it_was_trained(tmp_path):
 
 
 def test_what_is_no_recurrent_policy_is_refused(tmp_path):
-    (tmp_path / "policy.npz").write_text("nothing")
-    with pytest.raises(InputError, match="a policy"):
-        load(tmp_path / "policy.npz")
+    for content in ("nothing", "", "PK\x03\x04 cut off"):
+        (tmp_path / "policy.npz").write_text(content)
+        with pytest.raises(InputError, match="a policy"):
+            load(tmp_path / "policy.npz")
     with pytest.raises(InputError, match=r"the suffix \.npz"):
         save(HistoryPolicy(KEY, 4), tmp_path / "policy.json")
     save(HistoryPolicy(KEY, 4), tmp_path / "policy.npz")

@@ -79,3 +79,10 @@ def test_an_episode_that_is_over_takes_no_actions():
     assert environment.step({}) == ({}, {}, {}, {}, {})
     with pytest.raises(InputError, match="an episode under way"):
         environment.step(dict.fromkeys(environment.possible_agents, 1))
+
+
+def test_devices_sample_actions_of_their_own():
+    network = changing_network()
+    network.reset(seed=1)
+    spaces = [network.action_space(agent) for agent in network.agents]
+    assert len({tuple(space.sample() for _ in range(40)) for space in spaces}) == 4

@@ -6,12 +6,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from dtprob.data import NetworkLog
 from dtprob.errors import InputError
 from dtprob.inference import PointMass
 from dtprob.inference.exact import DirichletTables
 from dtprob.models.multi_access import kernel, priors, records, window_counts
 from dtprob.models.multi_access.abduction import Transition, abduct
-from dtprob.twin.counterfactual import Arm, average_effect, transitions, what_if
+from dtprob.twin.counterfactual import Arm, Effect, average_effect, transitions, what_if
 from dtprob.twin.rollout import random_access, throughput
 from tests.small_network import CLUSTERS, simulate
 
@@ -116,3 +117,51 @@ def test_transitions_carry_the_slot_before(log):
 def test_several_episodes_are_not_taken_for_one(posterior):
     with pytest.raises(InputError, match="episode: expected the slots of one, got those of 2"):
         what_if(jax.random.key(0), SYSTEM, posterior, simulate(12, 3, episodes=2), draws=3)
+
+
+def idle(slots, packets, first=0):
+    """Four devices whose buffers hold some packets, and in which nothing happens."""
+    nothing = np.zeros((slots, 4), int)
+    return NetworkLog(
+        episode=np.zeros(slots, int),
+        slot=np.arange(first, first + slots),
+        buffer=nothing + packets,
+        action=nothing,
+        ack=nothing,
+        arrival=nothing,
+    )
+
+
+def test_an_episode_of_another_network_is_refused(posterior):
+    """Run again with smaller buffers, or with other devices, it would not be the logged one."""
+    with pytest.raises(InputError, match="buffer_0: expected 1 packets, as capacity 1 leaves, got 2"):
+        what_if(jax.random.key(0), SYSTEM, posterior, idle(5, 2), draws=3)
+    what_if(jax.random.key(0), kernel(CLUSTERS, 2), posterior, idle(5, 2), draws=3)
+    with pytest.raises(InputError, match="expected 2 devices, as in the network, got 4"):
+        what_if(jax.random.key(0), kernel(((0, 1),)), posterior, idle(5, 1), draws=3)
+
+
+def test_a_policy_meets_the_slots_of_the_log(posterior):
+    """A log that begins in slot 3 of its episode is in another slot of a frame than one that begins in slot 0."""
+
+    def in_the_fifth(key, state):
+        return jnp.full(4, state.slot == 5)
+
+    slots = what_if(jax.random.key(0), SYSTEM, posterior, idle(5, 1, 3), policy=in_the_fifth, draws=40)
+    assert np.asarray(slots.collision).any(axis=0).tolist() == [False, False, True, False, False]
+
+
+def test_credible_limits_are_those_of_the_average_and_not_of_few_episodes():
+    random = np.random.default_rng(0)
+    effects = random.normal(size=(4000, 1)) + 4 * random.normal(size=(4000, 4))
+    np.testing.assert_allclose(Effect(effects).interval(), (-1.645, 1.645), atol=0.25)
+
+
+@pytest.mark.parametrize("wrong", [{"horizon": 0}, {"draws": 0}, {"episodes": 1}])
+def test_an_effect_of_nothing_is_refused(posterior, wrong):
+    arm = Arm(random_access(4, 0.3))
+    settings = {"horizon": 5, "draws": 2, "episodes": 2, **wrong}
+    with pytest.raises(InputError, match=f"{next(iter(wrong))}: expected"):
+        average_effect(
+            jax.random.key(0), SYSTEM, posterior, baseline=arm, alternative=arm, metric=throughput, **settings
+        )

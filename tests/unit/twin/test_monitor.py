@@ -84,6 +84,8 @@ def test_what_cannot_be_watched_is_refused(monitor, learned):
         Monitor(multi_access, monitor.draws, statistic="suprise")
     with pytest.raises(InputError, match="draws of what a change may bring"):
         Monitor(multi_access, monitor.draws, statistic="evidence")
+    with pytest.raises(InputError, match="expected 1 window or more, got 0"):
+        Monitor(multi_access, monitor.draws, run_length=0.0)
     few = {"log_arrival": monitor.draws["log_arrival"]}
     with pytest.raises(InputError, match="every latent site of multi_access, got no 'log_reception'"):
         window_likelihoods(multi_access, windows(simulate(20, 0)), few)

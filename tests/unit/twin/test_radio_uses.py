@@ -11,7 +11,7 @@ from dtprob.raytracing.calibration import project
 from dtprob.raytracing.field import frequency_response, path_gain, steering, synthesize
 from dtprob.raytracing.walls import between_walls
 from dtprob.twin.beamforming import Beams, gathered, statistical_beams
-from dtprob.twin.coverage import coverage_map
+from dtprob.twin.coverage import CoverageMap, coverage_map
 from dtprob.twin.localise import localise
 
 KEY = jax.random.key(0)
@@ -75,6 +75,11 @@ def test_materials_that_do_not_fit_the_map_are_named(paths):
     sampler = PointMass({"permittivity": np.full(2, 4.0), "conductivity": np.full(2, 0.1)})
     with pytest.raises(InputError, match="values of the 3 objects"):
         coverage_map(KEY, sampler, paths)
+
+
+def test_an_interval_of_no_probability_is_refused():
+    with pytest.raises(InputError, match="expected between 0 and 1, got 2"):
+        CoverageMap(np.ones((3, 1))).interval(2.0)
 
 
 def joined(candidates):

@@ -87,3 +87,12 @@ def test_windows_that_cannot_be_are_changes():
     np.testing.assert_allclose(statistics.log_evidence(changed, learned), [np.log(0.5), np.log(3), np.inf])
     nothing = np.full((2, 3), -np.inf)
     np.testing.assert_array_equal(statistics.log_evidence(nothing, learned), [-np.inf, -np.inf, np.inf])
+
+
+def test_a_factor_that_changed_for_sure_is_the_one_that_is_blamed():
+    """Its evidence has no bound in a window that cannot be under what was learned."""
+    evidence = {"arrivals": np.array([0.3, -1.0]), "reception": np.array([0.1, np.inf])}
+    assert statistics.blame(evidence) == {"arrivals": 0.0, "reception": 1.0}
+    assert statistics.shares({"a": np.inf, "b": np.inf, "c": 0.0}) == {"a": 0.5, "b": 0.5, "c": 0.0}
+    assert statistics.shares({"a": -np.inf, "b": -np.inf}) == {"a": 0.5, "b": 0.5}
+    assert statistics.shares({}) == {}

@@ -192,6 +192,9 @@ def test_luck_that_cannot_be_repeated_is_noticed_or_allowed():
     other = PlayedNetwork(changing_network(), 1, 1, replay=False)
     other.go_on(rows)
     assert other.play(TURNS, 3, np.random.default_rng(0))["episode"].tolist() == [1, 1, 1]
+    again = PlayedNetwork(changing_network(), 0, 1, replay=False)
+    again.go_on(rows)
+    assert not np.array_equal(again.play(TURNS, 50, np.random.default_rng(0))["arrival"], rows["arrival"])
 
 
 @pytest.mark.parametrize(
@@ -207,6 +210,11 @@ def test_luck_that_cannot_be_repeated_is_noticed_or_allowed():
         ("disconnect = [[500, 1]]", "disconect = [[500, 1]]", "what multi_access takes"),
         ('environment = "multi_access"', 'environment = "own:made"', "--no-code"),
         ('environment = "multi_access"', 'log = "no.csv"', "no.csv"),
+        ("[loop]", '[effects]\nuse = "device_disconected"\n[loop]', "Did you mean 'device_disconnected'?"),
+        ("[loop]", '[effects]\nexclude = ["bias"]\n[loop]', "[effects] exclude: expected one of"),
+        ("[loop]", '[effects]\nknown = ["drift"]\n[loop]', "[effects] known: expected nothing"),
+        ("clusters", "capacity = 1.5\nclusters", "options capacity: expected a whole number, got 1.5"),
+        ("clusters", 'traffic = ["markov"]\nclusters', "options traffic: expected text"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(tmp_path, capsys, old, new, told):
@@ -223,3 +231,35 @@ def test_a_state_of_another_case_is_refused(case, tmp_path):
     other = dataclasses.replace(case, loop=dataclasses.replace(case.loop, window=20))
     with pytest.raises(InputError, match="the state of this case"):
         load(other, tmp_path / "state.npz")
+
+
+def test_what_people_read_is_written_though_the_run_had_ended(case, tmp_path):
+    """A run that was killed between its last state and history.json."""
+    rows = connect(case).play(TURNS, 20, np.random.default_rng(0))
+    save(begin(case)._replace(rows=rows, phase="done"), case, tmp_path / "state.npz")
+    assert main(["twin", "run", str(case.path), "--out", str(tmp_path), "--resume"]) == 0
+    told = json.loads((tmp_path / "history.json").read_text())
+    assert told["finished"]
+    assert told["slots"] == 20
+    assert (tmp_path / "log.csv").is_file()
+
+
+@pytest.mark.parametrize("content", [b"", b"PK\x03\x04 cut off", b"no archive"])
+def test_what_is_no_state_is_refused(case, tmp_path, content):
+    (tmp_path / "state.npz").write_bytes(content)
+    with pytest.raises(InputError, match="Begin without --resume"):
+        load(case, tmp_path / "state.npz")
+
+
+class Scaled:
+    """A network whose one device sees its buffer as a share of the capacity."""
+
+    possible_agents = ("device_0",)
+
+    def reset(self, **_):
+        return {"device_0": np.array([0.5, 0.0, 1.0])}, {}
+
+
+def test_a_buffer_that_is_no_number_of_packets_is_refused():
+    with pytest.raises(InputError, match="observation of the physical twin: expected packets"):
+        PlayedNetwork(Scaled(), 0, 2, replay=True)

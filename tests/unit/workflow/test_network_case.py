@@ -89,6 +89,7 @@ def test_of_reference_data_the_unknowns_are_kept_and_nothing_for_each_slot(folde
         ("trafic = 'markov'", "Did you mean 'traffic'"),
         ("capacity = 2", "no loss below 2 packets"),
         ("window = 'long'", "values of the right type"),
+        ("window = 1.5", "values of the right type"),
         ("traffic = 'sometimes'", "expected one of the kinds of traffic"),
     ],
 )

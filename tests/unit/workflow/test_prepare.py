@@ -135,6 +135,9 @@ def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
     change(folder, "merge_shapes = false", "merge_shapes = true")
     prepare(load_case(folder / "case.toml"), need="fit", cache=folder / "out")
     assert len(traced) == 2
+    monkeypatch.setattr("dtprob.workflow.scene.edition", lambda: "another state of the code")
+    prepare(load_case(folder / "case.toml"), need="fit", cache=folder / "out")
+    assert len(traced) == 3
 
 
 def test_a_scene_whose_mesh_has_changed_is_traced_again(folder, monkeypatch):
