@@ -5,7 +5,7 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields, replace
 from pathlib import Path
-from typing import Any, Literal, NewType, cast, get_type_hints
+from typing import Any, Final, Literal, NewType, cast, get_type_hints
 
 from dtprob.errors import InputError, unknown_name
 
@@ -14,6 +14,9 @@ type Options = Mapping[str, Any]
 Share = NewType("Share", float)
 
 PHASES: tuple[Phase, ...] = ("coherent", "per_packet", "none")
+
+LARGEST: Final = 2**63 - 1
+"""Largest whole number that counts and seeds may be."""
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -153,7 +156,7 @@ class SeedSection:
     """[seed]: where randomness starts.
 
     Attributes:
-        value: a whole number from 0.
+        value: a whole number from 0 to `LARGEST`.
     """
 
     value: int = 0
@@ -302,7 +305,7 @@ def _is_number(value: Any) -> bool:
 
 
 def _is_whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+    return isinstance(value, int) and not isinstance(value, bool) and 0 <= value <= LARGEST
 
 
 def _is_text(value: Any) -> bool:

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import jax
 
-from dtprob.case import Case, EngineSection
+from dtprob.case import LARGEST, Case, EngineSection
 from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
@@ -57,8 +57,8 @@ def chosen(case: Case, engine: str | None, seed: int | None) -> Case:
         same = engine == case.engine.name
         case = replace(case, engine=case.engine if same else EngineSection(name=engine))
     if seed is not None:
-        if seed < 0:
-            raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
+        if not 0 <= seed <= LARGEST:
+            raise InputError("--seed", "a whole number from 0 to 2^63 - 1", str(seed), "Give another seed")
         case = replace(case, seed=replace(case.seed, value=seed))
     return case
 

@@ -193,7 +193,7 @@ class Track[C]:
     def _check(self, kinds: Sequence[str], families: Sequence[str], lambdas: Sequence[float]) -> None:
         _check_names("kinds", kinds, self.kinds, "kind")
         _check_names("families", families, self.families, "family")
-        if not kinds or not families or not lambdas or min(lambdas) <= 0:
+        if not kinds or not families or not lambdas or not all(0 < one < np.inf for one in lambdas):
             got = f"{len(kinds)} kinds, {len(families)} families, lambda {lambdas}"
             raise InputError(
                 "withheld cases", "kinds, families and positive values of lambda", got, "Give them"

@@ -42,7 +42,7 @@ class Prediction:
     def epistemic(self) -> float:
         """Variance for want of knowledge: of the draws' expected metrics, freed of the noise of their means.
 
-        0 for a point estimate; the sum of both is the metric's variance (law of total variance).
+        About 0 for a point estimate; the sum of both is the metric's variance (law of total variance).
         """
         draws, episodes = self.values.shape
         if draws < 2:

@@ -62,10 +62,15 @@ def threshold(normal: Float[np.ndarray, " window"], rate: float) -> float:
         rate: probability of a false alarm per window.
 
     Raises:
-        InputError: a rate outside of (0, 1), or too few windows for it.
+        InputError: a rate outside of (0, 1), too few windows for it, or one whose statistic is not a number.
     """
     if not 0 < rate < 1:
         raise InputError("rate of false alarms", "a probability between 0 and 1", f"{rate:g}", "Correct it")
+    if np.isnan(normal).any():
+        got = f"NaN in {int(np.isnan(normal).sum())} of {len(normal)}"
+        raise InputError(
+            "statistic of normal windows", "a number of each window", got, "Correct what it is told from"
+        )
     n = len(normal)
     place = int(np.ceil((n + 1) * (1 - rate) - 1e-9))
     if place > n:

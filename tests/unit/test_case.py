@@ -120,6 +120,10 @@ BAD = {
     "text": (f"{SHORT}[engine]\nname = 3\n", r"case\.toml \[engine\] name: expected text, got 3"),
     "whole": (f"{SHORT}[seed]\nvalue = 1.5\n", r"\[seed\] value: expected a whole number from 0, got 1\.5"),
     "negative": (f"{SHORT}[seed]\nvalue = -1\n", "expected a whole number from 0, got -1"),
+    "too large": (
+        f"{SHORT}[seed]\nvalue = {2**63}\n",
+        "expected a whole number from 0, got 9223372036854775808",
+    ),
     "truth": (f"{SHORT}[seed]\nvalue = true\n", "expected a whole number from 0, got True"),
     "flag": (
         f'{SHORT}[scene]\nfile = "a"\nrefraction = "no"\n',

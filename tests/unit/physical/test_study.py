@@ -71,6 +71,12 @@ def test_a_case_does_not_tell_its_kind_by_what_it_leaves_out():
     assert unlisted.left_out((), ["foreign"], ("a", "b"), 1.0) == ()
 
 
+@pytest.mark.parametrize("lambda_", [0.0, float("nan"), float("inf")])
+def test_a_lambda_is_a_positive_number(lambda_, tmp_path):
+    with pytest.raises(InputError, match="positive values of lambda"):
+        track(2.0).generate(tmp_path, 1, 0, lambda_=lambda_)
+
+
 def test_what_no_campaign_can_carry_is_refused(tmp_path):
     with pytest.raises(InputError, match="Ask for less"):
         track(1.0).generate(tmp_path, 1, 0, lambda_=1.0)

@@ -39,6 +39,8 @@ def test_p_values_reach_the_rate_where_the_threshold_alarms():
 def test_too_few_normal_windows_are_refused():
     with pytest.raises(InputError, match="19 or more, got 18"):
         statistics.threshold(np.arange(18.0), 0.05)
+    with pytest.raises(InputError, match="NaN in 1 of 30"):
+        statistics.threshold(np.array([*np.arange(29.0), np.nan]), 0.05)
     with pytest.raises(InputError, match="between 0 and 1"):
         statistics.threshold(np.arange(18.0), 1.5)
 
