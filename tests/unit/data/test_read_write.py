@@ -126,6 +126,13 @@ def test_written_channels_and_powers_come_back(tmp_path, suffix, kind):
     assert_same(read(tmp_path / f"data{suffix}"), data)
 
 
+def test_a_suffix_in_capitals_is_the_same_format(tmp_path):
+    """NumPy adds .npz to a name that does not end so: the file of that name was left empty."""
+    write(tmp_path / "data.NPZ", PowerData(**power_arrays()))
+    assert_same(read(tmp_path / "data.NPZ"), PowerData(**power_arrays()))
+    assert [file.name for file in tmp_path.iterdir()] == ["data.NPZ"]
+
+
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet"])
 def test_written_logs_and_labels_come_back(tmp_path, suffix):
     log = read(save(tmp_path / f"log{suffix}", log_columns()))
