@@ -100,6 +100,20 @@ def test_matlab_without_trailing_axes_and_with_a_scalar(tmp_path):
     assert data.noise_power.shape == ()
 
 
+@pytest.mark.parametrize("kind", ["column", "row"])
+def test_matlab_columns_are_vectors(tmp_path, kind):
+    """A plate over the rows of a 1 x n matrix has one entry, whatever n."""
+    columns = log_columns()
+    labels = {"x_0": np.arange(3.0), "x_1": np.ones(3), "y": np.array([1.0, np.nan, 2.0])}
+    table = {"distance": np.arange(1.0, 4.0), "grid": np.zeros((3, 2))}
+    for name, arrays in (("log", columns), ("labels", labels), ("table", table)):
+        scipy.io.savemat(tmp_path / f"{name}.mat", arrays, oned_as=kind)
+    assert_same(read(tmp_path / "log.mat"), read(save(tmp_path / "log.npz", columns)))
+    assert_same(read(tmp_path / "labels.mat"), read(save(tmp_path / "labels.npz", labels)))
+    for reader in (read, read_table):
+        assert_same(reader(tmp_path / "table.mat"), Table(table))
+
+
 def test_matlab_7_3_is_read_in_matlab_order(tmp_path):
     arrays = channel_arrays()
     path = tmp_path / "channels.mat"
