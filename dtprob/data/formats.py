@@ -148,7 +148,11 @@ def _read_csv(path: Path) -> Arrays:
     _check_lengths(path, len(header))
     names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
     unnamed = [name for name in names if name not in header]
-    table = pd.read_csv(path, header=0, names=names, usecols=range(len(names)))
+    layout: Any = {"header": 0, "names": names, "usecols": range(len(names))}
+    table = pd.read_csv(path, **layout)
+    absent = [name for name in names if table[name].dtype.kind not in "biuf" and table[name].isna().any()]
+    if absent:  # among words NA and None are words
+        table[absent] = pd.read_csv(path, **layout, dtype=str, keep_default_na=False)[absent]
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
 
 

@@ -406,6 +406,16 @@ def test_names_that_pandas_takes_for_nothing_are_names(tmp_path):
     assert list(read_table(tmp_path / "t.csv").columns) == ["NA", "None", "null"]
 
 
+def test_words_that_pandas_takes_for_nothing_are_words(tmp_path):
+    """Beside other words NA is a region and None a class; in a column of numbers they are missing."""
+    (tmp_path / "t.csv").write_text("region,blocked_by\nNA,None\nEU,wall\n,null\n")
+    found = read_table(tmp_path / "t.csv").columns
+    assert found["region"].tolist() == ["NA", "EU", ""]
+    assert found["blocked_by"].tolist() == ["None", "wall", "null"]
+    (tmp_path / "labels.csv").write_text("x,y\n0,1.5\n1,NA\n2,\n")
+    assert read(tmp_path / "labels.csv").labelled.tolist() == [True, False, False]
+
+
 def test_rows_that_end_in_a_comma_do_not_shift_columns(tmp_path):
     (tmp_path / "t.csv").write_text("a,b\n1,2,\n3,4,\n")
     found = read_table(tmp_path / "t.csv").columns
