@@ -276,6 +276,10 @@ BAD_CHANNELS = {
         "noise_power: expected values above 0, got -2",
     ),
     "repeat not whole": (lambda a: {"repeat": np.full(4, 0.5)}, "repeat: expected integer numbers"),
+    "repeat infinite": (
+        lambda a: {"repeat": np.array([0, 0, 1, np.inf])},
+        "repeat: expected integer numbers",
+    ),
     "repeat length": (
         lambda a: {"repeat": np.zeros(3, int)},
         r"repeat: expected shape \(snapshot=4,\), got \(3,\)",
@@ -321,6 +325,10 @@ BAD_COLUMNS = {
     "action": (lambda c: {"action_0": c["slot"]}, r"action_0: expected 0 or 1, got 2 in row 3 "),
     "slot twice": (lambda c: {"slot": c["slot"] * 0}, "slot: expected each slot of an episode once"),
     "negative": (lambda c: {"buffer_0": -1 - c["slot"]}, "buffer: expected values from 0 up, got -5"),
+    "infinite slot": (
+        lambda c: {"slot": np.where(c["slot"] == 4, np.inf, c["slot"])},
+        "slot: expected integer numbers",
+    ),
     "fraction": (lambda c: {"buffer_0": c["slot"] / 3}, "buffer: expected integer numbers"),
 }
 
