@@ -135,8 +135,8 @@ def _read_csv(path: Path) -> Arrays:
     twice = sorted({name for name in header if name and header.count(name) > 1})
     if twice:
         raise InputError(str(path), "columns of different names", f"{twice[0]!r} twice", "Rename one of them")
-    if len(header) == 1 and ";" in header[0]:
-        got, remedy = f"one, {header[0]!r}", "Write commas for semicolons, and points in numbers"
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        got, remedy = f"one, {header[0]!r}", "Write commas for semicolons or tabs, and points in numbers"
         raise InputError(str(path), "columns that commas separate", got, remedy)
     try:
         second = pd.read_csv(path, header=None, skiprows=1, nrows=1).iloc[0].tolist()

@@ -391,6 +391,7 @@ def test_bad_files_are_named(tmp_path):
     [
         ("x,y,x\n1,2,3\n", "columns of different names, got 'x' twice"),
         ("x;y\n1;2\n", "columns that commas separate"),
+        ("x\ty\n1\t2\n", "columns that commas separate"),
     ],
 )
 def test_tables_that_would_be_misread_are_refused(tmp_path, text, what):
