@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+import xarray as xr
 import zarr
 
 from dtprob.data import ChannelData, Labels, NetworkLog, PowerData, Table, read, read_table, write
@@ -130,6 +131,38 @@ def test_matlab_7_3_is_read_in_matlab_order(tmp_path):
     with path.open("r+b") as file:
         file.write(header)
     assert_same(read(path), ChannelData(**arrays))
+
+
+def test_an_empty_matrix_of_matlab_7_3_has_no_numbers(tmp_path):
+    """What the file holds of it is its shape."""
+    with h5py.File(tmp_path / "t.h5", "w") as file:
+        file["repeat"] = np.array([0, 4], np.uint64)
+        file["repeat"].attrs.update({"MATLAB_class": np.bytes_("double"), "MATLAB_empty": np.uint8(1)})
+    assert read_table(tmp_path / "t.h5").columns["repeat"].shape == (0, 4)
+
+
+def test_packed_and_missing_numbers_of_netcdf_are_what_they_stand_for(tmp_path):
+    arrays = power_arrays()
+    decibels = np.round(10 * np.log10(arrays.pop("power") / 1e-3), 2)
+    shapes = {
+        "power_db": ("link", "rx", "tx"),
+        "rx_position": ("link", "xyz"),
+        "tx_position": ("link", "xyz"),
+    }
+    packed = {"power_db": {"dtype": "int16", "scale_factor": 0.01, "add_offset": -50.0, "_FillValue": -32768}}
+    for name, power in (("all", decibels), ("hole", nan_at(decibels, (1, 0, 2), np.nan))):
+        given = {n: (shapes[n], a) for n, a in (arrays | {"power_db": power}).items()} | {
+            "power_reference": 1e-3
+        }
+        xr.Dataset(given).to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf", encoding=packed)
+    np.testing.assert_allclose(read(tmp_path / "all.nc").power, 1e-3 * 10 ** (decibels / 10), rtol=1e-9)
+    with pytest.raises(InputError, match=r"got NaN at index \(1, 0, 2\)"):
+        read(tmp_path / "hole.nc")
+    column = xr.Dataset({"level": ("row", [1.0, -9999.0])})
+    column["level"].encoding["_FillValue"] = -9999.0
+    column.to_netcdf(tmp_path / "column.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match="level: expected finite numbers, got NaN at index 1"):
+        read(tmp_path / "column.nc")
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".nc"])
