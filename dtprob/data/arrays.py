@@ -100,12 +100,17 @@ def _check(name: str, array: np.ndarray, spec: ArraySpec, sizes: dict[str, int])
 
 
 def _convert(name: str, array: np.ndarray, kind: NumberKind) -> np.ndarray:
-    if array.dtype.kind == "f" and kind == "integer" and np.array_equal(array, np.round(array)):
+    if array.dtype.kind == "f" and kind == "integer" and _is_whole(array):
         array = array.astype(np.int64)
     if array.dtype.kind not in _ACCEPTED[kind]:
         got = f"values of type {array.dtype}"
         raise InputError(name, f"{kind} numbers", got, f"Store {name} as {kind} numbers")
     return array.astype(_DTYPE[kind])
+
+
+def _is_whole(array: np.ndarray) -> bool:
+    """Whether all numbers are whole, and small enough to be told from their neighbours; infinity is not."""
+    return bool(np.all(np.abs(array) < 2.0**53)) and np.array_equal(array, np.round(array))
 
 
 def _match(

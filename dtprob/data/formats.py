@@ -12,6 +12,7 @@ from dtprob.errors import InputError
 
 type Arrays = dict[str, np.ndarray]
 
+_PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value")
 _NETCDF_DIMENSION_ONLY = b"This is a netCDF dimension but not a netCDF variable"
 
 
@@ -88,7 +89,7 @@ def _read_hdf5(path: Path) -> Arrays:
             if not isinstance(item, h5py.Dataset) or _NETCDF_DIMENSION_ONLY in _attribute(item, "NAME"):
                 continue
             array = np.asarray(item.asstr()[...] if h5py.check_string_dtype(item.dtype) else item[...])
-            arrays[name] = array.astype(str) if array.dtype.kind == "O" else _plain_complex(array)
+            arrays[name] = array.astype(str) if array.dtype.kind == "O" else _meant(array, item.attrs)
             if "MATLAB_class" in item.attrs:
                 arrays[name] = arrays[name].T
     return arrays
@@ -97,6 +98,19 @@ def _read_hdf5(path: Path) -> Arrays:
 def _attribute(item: Any, name: str) -> bytes:
     value = item.attrs.get(name, b"")
     return value.encode() if isinstance(value, str) else bytes(value)
+
+
+def _meant(array: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray:
+    """The numbers that stored ones stand for: packed or missing by the conventions of NetCDF, empty by MATLAB's."""
+    if attributes.get("MATLAB_empty"):
+        return np.zeros(tuple(map(int, array[::-1])))  # what is stored is the shape, in MATLAB's order
+    if array.dtype.kind not in "fiu":
+        return _plain_complex(array)
+    told = {name: np.ravel(attributes[name])[0] for name in _PACKED if name in attributes}
+    absent = [array == told[name] for name in ("_FillValue", "missing_value") if name in told]
+    if "scale_factor" in told or "add_offset" in told:
+        array = array * float(told.get("scale_factor", 1.0)) + float(told.get("add_offset", 0.0))
+    return np.where(np.any(absent, axis=0), np.nan, array) if np.any(absent) else array
 
 
 def _plain_complex(array: np.ndarray) -> np.ndarray:
@@ -135,8 +149,8 @@ def _read_csv(path: Path) -> Arrays:
     twice = sorted({name for name in header if name and header.count(name) > 1})
     if twice:
         raise InputError(str(path), "columns of different names", f"{twice[0]!r} twice", "Rename one of them")
-    if len(header) == 1 and ";" in header[0]:
-        got, remedy = f"one, {header[0]!r}", "Write commas for semicolons, and points in numbers"
+    if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
+        got, remedy = f"one, {header[0]!r}", "Write commas for semicolons or tabs, and points in numbers"
         raise InputError(str(path), "columns that commas separate", got, remedy)
     try:
         second = pd.read_csv(path, header=None, skiprows=1, nrows=1).iloc[0].tolist()
@@ -148,7 +162,11 @@ def _read_csv(path: Path) -> Arrays:
     _check_lengths(path, len(header))
     names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
     unnamed = [name for name in names if name not in header]
-    table = pd.read_csv(path, header=0, names=names, usecols=range(len(names)))
+    layout: Any = {"header": 0, "names": names, "usecols": range(len(names))}
+    table = pd.read_csv(path, **layout)
+    absent = [name for name in names if table[name].dtype.kind not in "biuf" and table[name].isna().any()]
+    if absent:  # among words NA and None are words
+        table[absent] = pd.read_csv(path, **layout, dtype=str, keep_default_na=False)[absent]
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
 
 

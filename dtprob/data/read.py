@@ -47,7 +47,7 @@ def read(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None)
     arrays = load_arrays(path)
     chosen = _known(options or {}, ("allow_gaps",) if _is_log(arrays) else (), path)
     try:
-        return _interpret(arrays, chosen, matlab=path.suffix.lower() == ".mat")
+        return _interpret(arrays, chosen, matlab=_is_matlab(path))
     except InputError as error:
         raise InputError(f"{path.name}: {error.what}", error.expected, error.got, error.remedy) from None
 
@@ -73,9 +73,13 @@ def read_table(path: str | os.PathLike[str]) -> Table:
     path = Path(path)
     arrays = load_arrays(path)
     try:
-        return Table(arrays)
+        return Table(_columns(arrays, matlab=_is_matlab(path)))
     except InputError as error:
         raise InputError(f"{path.name}: {error.what}", error.expected, error.got, error.remedy) from None
+
+
+def _is_matlab(path: Path) -> bool:
+    return path.suffix.lower() == ".mat"
 
 
 def _is_log(names: Iterable[str]) -> bool:
@@ -91,12 +95,12 @@ def _interpret(arrays: Arrays, options: Mapping[str, Any], *, matlab: bool) -> D
     if names & {"power", "power_db"}:
         return _powers(arrays, matlab=matlab)
     if _is_log(names):
-        return network.from_columns(arrays, **options)
+        return network.from_columns(_columns(arrays, matlab=matlab), **options)
     if "y" in names and names & {"x", "x_0"}:
         return _labels(arrays, matlab=matlab)
     if names & set(CHANNEL_ARRAYS):
         return _channels(arrays, matlab=matlab)
-    return Table(arrays)
+    return Table(_columns(arrays, matlab=matlab))
 
 
 def _channels(arrays: Arrays, *, matlab: bool) -> ChannelData:
@@ -152,7 +156,8 @@ def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
             raise InputError(
                 "x", f"columns x_0 to x_{len(numbered) - 1}", ", ".join(numbered), "Number them from 0"
             )
-        arrays["x"] = side_by_side({name: arrays.pop(name) for name in numbered})
+        columns = {name: arrays.pop(name) for name in numbered}
+        arrays["x"] = side_by_side(_columns(columns, matlab=matlab))
     optional = ("prediction", "weight", "context")
     for name in arrays:
         if name not in {"x", "y", *optional}:
@@ -174,6 +179,12 @@ def _canonical(arrays: Arrays, specs: Mapping[str, ArraySpec], *, matlab: bool) 
         if matlab
         else dict(arrays)
     )
+
+
+def _columns(arrays: Arrays, *, matlab: bool) -> Arrays:
+    """Columns of a table, which MATLAB has as matrices with one row or one column."""
+    flat = {name: array.ndim == 2 and 1 in array.shape for name, array in arrays.items() if matlab}
+    return {name: array.reshape(-1) if flat.get(name) else array for name, array in arrays.items()}
 
 
 def _matlab_shape(array: np.ndarray, spec: ArraySpec) -> np.ndarray:

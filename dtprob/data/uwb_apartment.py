@@ -190,7 +190,7 @@ def channels(
         level: "unit" for a mean power of 1, "reported" for the received power that the radio reports, in W.
 
     Raises:
-        InputError: a link that is not there, fewer than 2 averages, or no such level.
+        InputError: a link that is not there, fewer than 2 averages or more than packets, or no such level.
     """
     radio = read_radio(folder)
     chosen = _chosen(read_links(folder), links, averages, level)
@@ -212,14 +212,20 @@ def channels(
 def _chosen(known: Sequence[Link], links: Sequence[int] | None, averages: int, level: str) -> list[Link]:
     if level not in {"unit", "reported"}:
         raise InputError(f"{NAME} level", "unit or reported", repr(level), "Correct the value")
-    if averages < 2:
+    if type(averages) is not int or averages < 2:
         raise InputError(f"{NAME} averages", "2 or more", repr(averages), "Correct the value")
-    numbers = {link.number for link in known}
-    missing = sorted(set(links or ()) - numbers)
-    if missing or (links is not None and not links):
-        expected = f"numbers among {', '.join(map(str, sorted(numbers)))}"
+    numbers = [link.number for link in known]
+    asked = numbers if links is None else links
+    missing = [one for one in asked if one not in numbers] if np.ndim(asked) == 1 else asked
+    if missing or not asked:
+        expected = f"a list of numbers among {', '.join(map(str, sorted(numbers)))}"
         raise InputError(f"{NAME} links", expected, str(missing), "Name links that exist")
-    return [link for link in known if links is None or link.number in links]
+    chosen = [link for link in known if link.number in asked]
+    fewest = min(chosen, key=lambda link: len(link.impulse_response))
+    if averages > len(fewest.impulse_response):
+        expected = f"at most {len(fewest.impulse_response)}, the packets of link {fewest.number}"
+        raise InputError(f"{NAME} averages", expected, str(averages), "Take fewer averages")
+    return chosen
 
 
 def _averages(

@@ -80,7 +80,7 @@ class _Lines:
         self._name, self._number = path.name, 0
         self._rest: Iterator[tuple[int, str]] = iter(
             (number, text)
-            for number, text in enumerate(path.read_text(encoding="utf-8").splitlines(), 1)
+            for number, text in enumerate(_text(path).splitlines(), 1)
             if text.strip() and not text.lstrip().startswith("#")
         )
 
@@ -100,22 +100,36 @@ class _Lines:
         except ValueError:
             raise self.wrong(what, " ".join(found)) from None
 
+    def counts(self, count: int, what: str) -> list[int]:
+        """The next line's whole numbers from 0 on, so many of them."""
+        found = self.words(count, what)
+        if not all(word.isdecimal() for word in found):
+            raise self.wrong(what, " ".join(found))
+        return [int(word) for word in found]
+
     def wrong(self, expected: str, got: str) -> InputError:
         """What to raise for the latest line."""
         return InputError(f"{self._name} line {self._number}", expected, f"'{got}'", "Export the file again")
 
 
+def _text(path: Path) -> str:
+    """The text of a file, whose comments may be of any encoding."""
+    return path.read_text(encoding="utf-8-sig", errors="replace")
+
+
 def _receivers(lines: _Lines) -> Iterator[list[_Path]]:
-    (count,) = lines.numbers(1, "the number of receivers")
-    for _ in range(int(count)):
-        _, paths = lines.numbers(2, "a receiver and its number of paths")
+    (count,) = lines.counts(1, "the number of receivers")
+    for _ in range(count):
+        _, paths = lines.counts(2, "a receiver and its number of paths")
         if paths:
             lines.words(None, "a summary of the paths")
-        yield [_read_path(lines) for _ in range(int(paths))]
+        yield [_read_path(lines) for _ in range(paths)]
 
 
 def _read_path(lines: _Lines) -> _Path:
     values = lines.numbers(9, "the nine numbers of a path")
+    if not np.all(np.isfinite(values)):
+        raise lines.wrong("nine finite numbers of a path", " ".join(map(str, values)))
     (chain,) = lines.words(1, "a chain of interactions from Tx to Rx")
     steps = chain.split("-")
     expected = f"a chain of {int(values[1])} interactions from Tx to Rx"

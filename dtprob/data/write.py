@@ -35,8 +35,11 @@ def write(path: str | os.PathLike[str], data: Data) -> None:
     suffix = path.suffix.lower()
     arrays = file_arrays(data)
     if suffix == ".npz":
-        with atomic_write(path) as temporary:
-            np.savez(temporary, allow_pickle=False, **arrays)
+        with (
+            atomic_write(path) as temporary,
+            temporary.open("wb") as stream,
+        ):  # a name in capitals would be changed
+            np.savez(stream, allow_pickle=False, **arrays)
     elif suffix == ".nc" and isinstance(data, ChannelData | PowerData):
         _write_netcdf(path, arrays, CHANNEL_ARRAYS if isinstance(data, ChannelData) else POWER_ARRAYS)
     elif suffix in {".csv", ".parquet"} and isinstance(data, NetworkLog | Labels):

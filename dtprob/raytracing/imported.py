@@ -48,9 +48,13 @@ def path_set(imported: ImportedPaths, frequency: float, provenance: tuple[tuple[
         provenance: where the paths come from.
 
     Raises:
-        InputError: no path at all, or a delay that is not positive.
+        InputError: no path at all, a delay that is not positive, or such a carrier.
     """
     mask = imported.mask
+    if not frequency > 0:
+        raise InputError(
+            "carrier of the imported paths", "a positive frequency in Hz", f"{frequency:g}", "Give it in Hz"
+        )
     if not mask.any():
         raise InputError("imported paths", "a path or more", "none", "Export links that are reached")
     delay = np.where(mask, imported.delay, 0.0).astype(np.float64)

@@ -135,15 +135,18 @@ class PathSet(eqx.Module):
             links: indices of links, or a boolean mask over them.
 
         Raises:
-            InputError: an index names no link.
+            InputError: an index names no link, or a mask is of another number of links.
         """
         index = np.asarray(links)
-        if index.dtype == bool:
+        if index.dtype == bool and index.shape == (self.n_link,):
             index = np.flatnonzero(index)
-        if index.ndim != 1 or np.any((index < 0) | (index >= self.n_link)):
+        if index.ndim != 1 or index.dtype.kind not in "iu" or np.any((index < 0) | (index >= self.n_link)):
             got = np.array2string(index, threshold=8)
             raise InputError(
-                "links to take", f"indices from 0 to {self.n_link - 1}", got, "Name links that exist"
+                "links to take",
+                f"indices from 0 to {self.n_link - 1}, or a mask of {self.n_link}",
+                got,
+                "Name links that exist",
             )
         chosen = {
             name: jnp.asarray(getattr(self, name))[index]

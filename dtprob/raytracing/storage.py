@@ -77,16 +77,7 @@ def load(file: str | os.PathLike[str]) -> PathSet:
         raise InputError(f"path set {path}", "a NetCDF file", f"'{error}'", _REMEDY) from error
     _check_format(path, data)
     arrays: dict[str, Any] = {name: _array(path, data, name) for name in DIMENSIONS}
-    return validate(
-        PathSet(
-            **arrays,
-            frequency=float(data.attrs["frequency"]),
-            object_names=tuple(map(str, data["object_name"].to_numpy())),
-            material_names=tuple(map(str, data["material_name"].to_numpy())),
-            beyond_names=tuple(json.loads(data.attrs.get("beyond_names", "[]"))),
-            provenance=tuple((name, value) for name, value in json.loads(data.attrs["provenance"])),
-        )
-    )
+    return validate(PathSet(**arrays, **_described(path, data)))
 
 
 def is_path_set(file: str | os.PathLike[str]) -> bool:
@@ -106,6 +97,25 @@ def _check_format(path: Path, data: xr.Dataset) -> None:
     if number != FORMAT_VERSION:
         expected = f"format_version {FORMAT_VERSION}"
         raise InputError(f"path set {path}", expected, f"format_version {number}", _REMEDY)
+
+
+def _described(path: Path, data: xr.Dataset) -> dict[str, Any]:
+    """What a path set holds beside its arrays."""
+    missing = [name for name in ("object_name", "material_name") if name not in data]
+    missing += [name for name in ("frequency", "provenance") if name not in data.attrs]
+    if missing:
+        raise InputError(f"path set {path}", f"'{missing[0]}'", "none", _REMEDY)
+    try:
+        return {
+            "frequency": float(data.attrs["frequency"]),
+            "object_names": tuple(map(str, data["object_name"].to_numpy())),
+            "material_names": tuple(map(str, data["material_name"].to_numpy())),
+            "beyond_names": tuple(json.loads(data.attrs.get("beyond_names", "[]"))),
+            "provenance": tuple((name, value) for name, value in json.loads(data.attrs["provenance"])),
+        }
+    except (ValueError, TypeError) as error:
+        expected = "a frequency in Hz, and beyond_names and provenance in JSON"
+        raise InputError(f"path set {path}", expected, f"'{error}'", _REMEDY) from error
 
 
 def _array(path: Path, data: xr.Dataset, name: str) -> Array | None:

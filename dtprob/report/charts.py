@@ -93,7 +93,7 @@ def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
                     data["tx_position"].values,
                     data[name].values,
                     classes=classes,
-                    label="Excess of each link (nats)",
+                    label="Excess of each link (nats per observation)",
                 ),
                 _plan_alt(data[name], data["rx_position"].values, name),
             ),
@@ -144,8 +144,8 @@ def _plan_alt(value: xr.DataArray, rx_position: np.ndarray, name: str) -> str:
     x, y = rx_position[worst, :2]
     median = number(float(np.median(value.values)))
     return (
-        f"Plan view, {_WHEN[name].lower()}: {value.size} links, median excess {median} nats, "
-        f"worst {number(float(value.values[worst]))} nats at x {x:.1f} m, y {y:.1f} m."
+        f"Plan view, {_WHEN[name].lower()}: {value.size} links, median excess {median} nats per observation, "
+        f"worst {number(float(value.values[worst]))} at x {x:.1f} m, y {y:.1f} m."
     )
 
 

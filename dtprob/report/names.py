@@ -231,7 +231,8 @@ def block(entry: Coordinates) -> str:
 
 def _span(low: float, high: float) -> str:
     """`3`, or `7 to 9` on one line."""
-    return f"{low:.6g}" + ("" if low == high else f"\u00a0to\u00a0{high:.6g}")
+    first, last = (f"{end:.0f}" if float(end).is_integer() else f"{end:.6g}" for end in (low, high))
+    return first if low == high else f"{first}\u00a0to\u00a0{last}"
 
 
 def is_factor(parameter: str, unit: str) -> bool:

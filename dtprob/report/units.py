@@ -171,7 +171,8 @@ def percent(value: float | None) -> str:
     """A share in percent."""
     if value is None:
         return DASH
-    return f"{100 * value:.0f}%".replace("-", _MINUS)
+    text = f"{100 * value:.0f}%"
+    return "0%" if text == "-0%" else text.replace("-", _MINUS)
 
 
 def p_value(value: float | None) -> str:

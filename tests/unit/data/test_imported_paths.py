@@ -198,6 +198,9 @@ def test_a_p2m_file_gives_its_channel(tmp_path, transmit_power):
     ("line", "text", "message"),
     [
         (3, "three", "line 4: expected the number of receivers, got 'three'"),
+        (3, "nan", "line 4: expected the number of receivers, got 'nan'"),
+        (4, "1 inf", "line 5: expected a receiver and its number of paths, got '1 inf'"),
+        (6, "1 nan -60 0 1e-7 90 0 90 0", "line 7: expected nine finite numbers"),
         (6, "1 0 -60", "line 7: expected the nine numbers of a path"),
         (7, "Tx-Q-Rx", "line 8: expected a chain of 0 interactions"),
         (7, "Tx-R-Rx", "line 8: expected a chain of 0 interactions"),
@@ -211,6 +214,15 @@ def test_a_damaged_p2m_line_is_named(tmp_path, line, text, message):
     file.write_text("\n".join(lines))
     with pytest.raises(InputError, match=message):
         read_p2m(file, CARRIER)
+
+
+def test_comments_of_a_p2m_file_may_be_of_any_encoding(tmp_path):
+    """Windows writes the sign of a degree in one byte, and a mark before the first line."""
+    file = tmp_path / "street.paths.t001_01.r002.p2m"
+    file.write_bytes(b"\xef\xbb\xbf# angles in \xb0\n" + "\n".join(p2m()).encode())
+    check(read_p2m(file, CARRIER))
+    with pytest.raises(InputError, match="a positive frequency in Hz, got 0"):
+        read_p2m(file, 0.0)
 
 
 def test_a_p2m_file_that_ends_early_or_is_missing_is_named(tmp_path):

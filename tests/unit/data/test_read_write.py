@@ -8,6 +8,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import scipy.io
+import xarray as xr
 import zarr
 
 from dtprob.data import ChannelData, Labels, NetworkLog, PowerData, Table, read, read_table, write
@@ -100,6 +101,20 @@ def test_matlab_without_trailing_axes_and_with_a_scalar(tmp_path):
     assert data.noise_power.shape == ()
 
 
+@pytest.mark.parametrize("kind", ["column", "row"])
+def test_matlab_columns_are_vectors(tmp_path, kind):
+    """A plate over the rows of a 1 x n matrix has one entry, whatever n."""
+    columns = log_columns()
+    labels = {"x_0": np.arange(3.0), "x_1": np.ones(3), "y": np.array([1.0, np.nan, 2.0])}
+    table = {"distance": np.arange(1.0, 4.0), "grid": np.zeros((3, 2))}
+    for name, arrays in (("log", columns), ("labels", labels), ("table", table)):
+        scipy.io.savemat(tmp_path / f"{name}.mat", arrays, oned_as=kind)
+    assert_same(read(tmp_path / "log.mat"), read(save(tmp_path / "log.npz", columns)))
+    assert_same(read(tmp_path / "labels.mat"), read(save(tmp_path / "labels.npz", labels)))
+    for reader in (read, read_table):
+        assert_same(reader(tmp_path / "table.mat"), Table(table))
+
+
 def test_matlab_7_3_is_read_in_matlab_order(tmp_path):
     arrays = channel_arrays()
     path = tmp_path / "channels.mat"
@@ -118,12 +133,51 @@ def test_matlab_7_3_is_read_in_matlab_order(tmp_path):
     assert_same(read(path), ChannelData(**arrays))
 
 
+def test_an_empty_matrix_of_matlab_7_3_has_no_numbers(tmp_path):
+    """What the file holds of it is its shape."""
+    with h5py.File(tmp_path / "t.h5", "w") as file:
+        file["repeat"] = np.array([0, 4], np.uint64)
+        file["repeat"].attrs.update({"MATLAB_class": np.bytes_("double"), "MATLAB_empty": np.uint8(1)})
+    assert read_table(tmp_path / "t.h5").columns["repeat"].shape == (0, 4)
+
+
+def test_packed_and_missing_numbers_of_netcdf_are_what_they_stand_for(tmp_path):
+    arrays = power_arrays()
+    decibels = np.round(10 * np.log10(arrays.pop("power") / 1e-3), 2)
+    shapes = {
+        "power_db": ("link", "rx", "tx"),
+        "rx_position": ("link", "xyz"),
+        "tx_position": ("link", "xyz"),
+    }
+    packed = {"power_db": {"dtype": "int16", "scale_factor": 0.01, "add_offset": -50.0, "_FillValue": -32768}}
+    for name, power in (("all", decibels), ("hole", nan_at(decibels, (1, 0, 2), np.nan))):
+        given = {n: (shapes[n], a) for n, a in (arrays | {"power_db": power}).items()} | {
+            "power_reference": 1e-3
+        }
+        xr.Dataset(given).to_netcdf(tmp_path / f"{name}.nc", engine="h5netcdf", encoding=packed)
+    np.testing.assert_allclose(read(tmp_path / "all.nc").power, 1e-3 * 10 ** (decibels / 10), rtol=1e-9)
+    with pytest.raises(InputError, match=r"got NaN at index \(1, 0, 2\)"):
+        read(tmp_path / "hole.nc")
+    column = xr.Dataset({"level": ("row", [1.0, -9999.0])})
+    column["level"].encoding["_FillValue"] = -9999.0
+    column.to_netcdf(tmp_path / "column.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match="level: expected finite numbers, got NaN at index 1"):
+        read(tmp_path / "column.nc")
+
+
 @pytest.mark.parametrize("suffix", [".npz", ".nc"])
 @pytest.mark.parametrize("kind", ["channel", "power"])
 def test_written_channels_and_powers_come_back(tmp_path, suffix, kind):
     data = ChannelData(**channel_arrays()) if kind == "channel" else PowerData(**power_arrays())
     write(tmp_path / f"data{suffix}", data)
     assert_same(read(tmp_path / f"data{suffix}"), data)
+
+
+def test_a_suffix_in_capitals_is_the_same_format(tmp_path):
+    """NumPy adds .npz to a name that does not end so: the file of that name was left empty."""
+    write(tmp_path / "data.NPZ", PowerData(**power_arrays()))
+    assert_same(read(tmp_path / "data.NPZ"), PowerData(**power_arrays()))
+    assert [file.name for file in tmp_path.iterdir()] == ["data.NPZ"]
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".csv", ".parquet"])
@@ -255,6 +309,10 @@ BAD_CHANNELS = {
         "noise_power: expected values above 0, got -2",
     ),
     "repeat not whole": (lambda a: {"repeat": np.full(4, 0.5)}, "repeat: expected integer numbers"),
+    "repeat infinite": (
+        lambda a: {"repeat": np.array([0, 0, 1, np.inf])},
+        "repeat: expected integer numbers",
+    ),
     "repeat length": (
         lambda a: {"repeat": np.zeros(3, int)},
         r"repeat: expected shape \(snapshot=4,\), got \(3,\)",
@@ -300,6 +358,10 @@ BAD_COLUMNS = {
     "action": (lambda c: {"action_0": c["slot"]}, r"action_0: expected 0 or 1, got 2 in row 3 "),
     "slot twice": (lambda c: {"slot": c["slot"] * 0}, "slot: expected each slot of an episode once"),
     "negative": (lambda c: {"buffer_0": -1 - c["slot"]}, "buffer: expected values from 0 up, got -5"),
+    "infinite slot": (
+        lambda c: {"slot": np.where(c["slot"] == 4, np.inf, c["slot"])},
+        "slot: expected integer numbers",
+    ),
     "fraction": (lambda c: {"buffer_0": c["slot"] / 3}, "buffer: expected integer numbers"),
 }
 
@@ -362,6 +424,7 @@ def test_bad_files_are_named(tmp_path):
     [
         ("x,y,x\n1,2,3\n", "columns of different names, got 'x' twice"),
         ("x;y\n1;2\n", "columns that commas separate"),
+        ("x\ty\n1\t2\n", "columns that commas separate"),
     ],
 )
 def test_tables_that_would_be_misread_are_refused(tmp_path, text, what):
@@ -383,6 +446,16 @@ def test_blanks_around_names_and_a_trailing_comma_are_forgiven(tmp_path):
 def test_names_that_pandas_takes_for_nothing_are_names(tmp_path):
     (tmp_path / "t.csv").write_text("NA,None,null\n1,2,3\n4,5,6\n")
     assert list(read_table(tmp_path / "t.csv").columns) == ["NA", "None", "null"]
+
+
+def test_words_that_pandas_takes_for_nothing_are_words(tmp_path):
+    """Beside other words NA is a region and None a class; in a column of numbers they are missing."""
+    (tmp_path / "t.csv").write_text("region,blocked_by\nNA,None\nEU,wall\n,null\n")
+    found = read_table(tmp_path / "t.csv").columns
+    assert found["region"].tolist() == ["NA", "EU", ""]
+    assert found["blocked_by"].tolist() == ["None", "wall", "null"]
+    (tmp_path / "labels.csv").write_text("x,y\n0,1.5\n1,NA\n2,\n")
+    assert read(tmp_path / "labels.csv").labelled.tolist() == [True, False, False]
 
 
 def test_rows_that_end_in_a_comma_do_not_shift_columns(tmp_path):

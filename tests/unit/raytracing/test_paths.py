@@ -36,7 +36,7 @@ def test_take(box, links):
     assert np.array_equal(some.permittivity, box.permittivity)
 
 
-@pytest.mark.parametrize("links", [[3], [-1], [[0]]])
+@pytest.mark.parametrize("links", [[3], [-1], [[0]], [0.0], [True], [True, False, True, False]])
 def test_take_no_such_link(box, links):
     with pytest.raises(InputError, match="indices from 0 to 2"):
         box.take(links)

@@ -96,3 +96,23 @@ def test_what_is_no_path_set(stored, tmp_path):
             load(file)
     assert not is_path_set(text)
     assert not is_path_set(other)
+
+
+@pytest.mark.parametrize(
+    ("lost", "attributes", "message"),
+    [
+        ("object_name", {}, "'object_name', got none"),
+        ("material_name", {}, "'material_name', got none"),
+        ("frequency", {}, "'frequency', got none"),
+        ("provenance", {}, "'provenance', got none"),
+        ("", {"frequency": "6 GHz"}, "a frequency in Hz, and"),
+        ("", {"provenance": "{"}, "provenance in JSON"),
+    ],
+)
+def test_a_set_that_lacks_what_describes_it_is_named(stored, tmp_path, lost, attributes, message):
+    with xr.open_dataset(stored, engine="h5netcdf") as opened:
+        data = opened.load().drop_vars([lost], errors="ignore").assign_attrs(attributes)
+    data.attrs.pop(lost, None)
+    data.to_netcdf(tmp_path / "other.nc", engine="h5netcdf")
+    with pytest.raises(InputError, match=message):
+        load(tmp_path / "other.nc")

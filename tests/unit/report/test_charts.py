@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from dtprob.report.axis_charts import closed_charts, coordinate_charts
+from dtprob.report.charts import plan_charts
 
 
 def caption(verdict: str, excess: list[float], *, named: bool = False) -> str:
@@ -71,3 +72,13 @@ def test_places_keep_their_numbers_where_others_are_not_shown() -> None:
     gap = xr.DataTree.from_dict({"where": xr.Dataset({"gap_link": ("link", excess)})})
     (chart,) = coordinate_charts(report, gap)
     assert "9.00 standard deviations at 3" in chart.svg
+
+
+def test_the_map_of_links_has_the_unit_of_its_numbers() -> None:
+    """gap.nc holds the loss of each link over its number of observations."""
+    report: Any = {"gap": {"after": None}}
+    ends = {f"{end}_position": (("link", "direction"), np.arange(6.0).reshape(2, 3)) for end in ("rx", "tx")}
+    gap = xr.DataTree.from_dict({"links": xr.Dataset({"before": ("link", np.array([0.0, 0.5])), **ends})})
+    (chart,) = plan_charts(report, gap)
+    assert "Excess of each link (nats per observation)" in chart.svg
+    assert "median excess 0.250 nats per observation, worst 0.500 at x 3.0 m, y 4.0 m" in chart.svg

@@ -42,6 +42,12 @@ def test_blocks_told_together_are_one_line() -> None:
     assert names.block({"axes": {"row": (3, 4)}, "p_value": 1e-5, "share": 0.4}) == "row 3\u00a0to\u00a04"
 
 
+def test_a_row_is_told_by_its_whole_number() -> None:
+    block: names.Coordinates = {"axes": {"row": (1234567, 1234890)}, "p_value": 1e-5, "share": 0.4}
+    assert names.block(block) == "row 1234567\u00a0to\u00a01234890"
+    assert names.block({**block, "axes": {"angle": (-0.1234567, 2.0)}}) == "angle -0.123457\u00a0to\u00a02"
+
+
 def test_aliases_leave_the_cause_out() -> None:
     assert names.aliases(_cause("a", "b", alias=[["b", "a"], ["c"]])) == [["c"]]
 

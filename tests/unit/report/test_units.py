@@ -84,7 +84,13 @@ def test_probabilities_are_never_rounded_to_certainty() -> None:
         "> 99%",
         "> 99%",
     ]
-    assert [percent(share) for share in (0.0, 0.004, 1.0, -0.1)] == ["0%", "0%", "100%", "−10%"]
+    assert [percent(share) for share in (0.0, 0.004, 1.0, -0.1, -0.003)] == [
+        "0%",
+        "0%",
+        "100%",
+        "−10%",
+        "0%",
+    ]
 
 
 def test_odds_are_told_with_one_digit() -> None:
