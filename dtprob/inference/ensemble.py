@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from dtprob.errors import InputError
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
+from dtprob.inference.circular import wrap
 from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
 from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.modes import find_mode
@@ -265,6 +266,10 @@ def _block(  # noqa: PLR0917
 
 
 def _prior_shift(target: Target, key: PRNGKeyArray, inputs: Inputs) -> Float[Array, " dimension"]:
-    """How far a member's prior is from the model's: mean zero, and the prior's own covariance."""
+    """How far a member's prior is from the model's: mean zero, and the prior's own covariance.
+
+    Draws of an angle on both sides of +-pi are close to each other.
+    """
     first, second = (target.prior_draw(k, inputs) for k in jax.random.split(key))
-    return (first - second) / jnp.sqrt(2.0)
+    apart = first - second
+    return jnp.where(target.circular, wrap(apart), apart) / jnp.sqrt(2.0)

@@ -92,6 +92,18 @@ def test_angles_and_discrete_data():
         Ensemble(resample="noise")(KEY, logistic, logistic_data())
 
 
+def test_an_angle_whose_prior_lies_across_the_cut_has_the_spread_of_its_prior():
+    """Without data members are draws of the prior, here within .2 rad or so of pi."""
+
+    def untold(y=None):
+        numpyro.sample("angle", dist.VonMises(jnp.pi, 25.0))
+        numpyro.sample("y", dist.Normal(0.0, 1.0), obs=y)
+
+    posterior = Ensemble(members=64, resample="none")(KEY, untold, {"y": jnp.zeros(())})
+    error = np.angle(np.exp(1j * (posterior.draws["angle"] - np.pi)))
+    assert np.std(error) == pytest.approx(25**-0.5, rel=0.3)
+
+
 def test_any_engine_can_be_the_base():
     """Bagging: the members' mean spreads by about as much as the data tell, on top of each one's own spread."""
     data = linear_data()
