@@ -54,6 +54,12 @@ def test_sample():
         made.sample(KEY, 0)
 
 
+def test_a_site_without_entries_is_sampled_like_any_other():
+    made = Posterior(draws={"level": np.zeros((2, 5)), "empty": np.zeros((2, 5, 0, 3))})
+    assert made.flat("empty").shape == (10, 0, 3)
+    assert made.sample(KEY, 4)["empty"].shape == (4, 0, 3)
+
+
 def test_point_mass_is_the_same_kind_of_thing():
     point = PointMass({"x": np.arange(3.0), "s": 2.0})
     assert isinstance(point, Sampler)
