@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -24,7 +24,15 @@ from dtprob.errors import InputError
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
 from dtprob.inference.circular import wrap
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
+from dtprob.inference.engine import (
+    DEFAULT,
+    AbstractEngine,
+    Answer,
+    RunOptions,
+    check_choice,
+    check_counts,
+    check_key,
+)
 from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.modes import find_mode
 from dtprob.inference.optimise import minimise
@@ -110,6 +118,7 @@ class Ensemble(AbstractEngine):
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
         check_counts(self, {"members": 1, "starts": 1, "max_steps": 1})
+        check_choice(self, "resample", ("auto", *get_args(Scheme.__value__)))
         check_key(key)
         target, inputs = build_target(model, data)
         is_point = self.base == "point"

@@ -76,6 +76,21 @@ def test_a_model_that_reads_something_that_has_changed_is_another_one():
         assert float(np.std(found.draws["level"])) == pytest.approx(deviation / np.sqrt(50), rel=0.1)
 
 
+@pytest.mark.parametrize(
+    ("engine", "setting", "value", "remedy"),
+    [
+        ("point", "objective", "max_likelihood", "Did you mean 'maximum_likelihood'"),
+        ("point", "objective", "density", "choice"),
+        ("svi", "guide", "full", "Did you mean 'full_rank'"),
+        ("ensemble", "resample", "cluster", "Did you mean 'clusters'"),
+        ("nuts", "chain_method", "vectorised", "Did you mean 'vectorized'"),
+    ],
+)
+def test_a_setting_that_is_no_choice_is_refused(engine, setting, value, remedy):
+    with pytest.raises(InputError, match=f"{setting} of engine {engine}.*{remedy}"):
+        fit(normal, normal_data(), engine=engine, key=KEY, **{setting: value})
+
+
 @pytest.mark.parametrize("engine", ["nuts", "blackjax_nuts"])
 def test_chains_do_not_stand_where_the_density_is_nowhere_finite(engine):
     def model(y=None):
