@@ -4,12 +4,15 @@ import json
 
 import jax
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 
 from dtprob.errors import InputError
 from dtprob.inference import HMC, NUTS, BlackJAXNUTS, RunOptions, checkpoint, summary
 from dtprob.inference import run as run_module
 from dtprob.inference.build import build_target
+from dtprob.inference.identity import identity
 from tests.unit.inference.examples import (
     at_the_cut,
     at_the_cut_data,
@@ -133,9 +136,6 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
 
 
 def test_a_checkpoint_of_another_version_or_model_is_refused(tmp_path, monkeypatch):
-    import numpyro
-    import numpyro.distributions as dist
-
     path = tmp_path / "run.h5"
     options = RunOptions(checkpoint=path, chunk=50, resume=True)
     NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
@@ -154,6 +154,25 @@ def test_a_checkpoint_of_another_version_or_model_is_refused(tmp_path, monkeypat
     path.write_text("no checkpoint")
     with pytest.raises(InputError, match="expected an HDF5 file"):
         NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
+
+
+def test_a_checkpoint_of_a_model_that_reads_something_else_by_now_is_refused():
+    """What a model holds besides its data counts as what it computes."""
+
+    class Reading:
+        offset = np.zeros(12)
+
+        def __call__(self, y=None):
+            level = numpyro.sample("level", dist.Normal(1.0, 3.0))
+            with numpyro.plate("row", 12):
+                numpyro.sample("y", dist.Normal(level + self.offset, 1.0), obs=y)
+
+    model, data, known = Reading(), {"y": np.ones(12)}, []
+    for offset in (0.0, 0.0, 1.0):
+        model.offset = np.full(12, offset)
+        known.append(identity(*build_target(model, data), NUTS(), KEY))
+    assert known[0] == known[1]
+    assert known[0]["density"] != known[2]["density"]
 
 
 def test_without_resume_an_old_checkpoint_is_replaced(tmp_path):
