@@ -12,6 +12,7 @@ from dtprob.errors import InputError
 from dtprob.inference import HMC, NUTS, BlackJAXNUTS, RunOptions, checkpoint, summary
 from dtprob.inference import run as run_module
 from dtprob.inference.build import build_target
+from dtprob.inference.enough import Enough
 from dtprob.inference.identity import identity
 from tests.unit.inference.examples import (
     at_the_cut,
@@ -208,6 +209,22 @@ def test_stops_early_once_there_is_enough(tmp_path):
         assert same(stopped, engine(KEY, normal, data, options=options))
     never = NUTS(warmup=100, draws=300, chains=2, enough_ess=10_000)(KEY, normal, data)
     assert never.draws_per_chain == 300
+
+
+@pytest.mark.parametrize("kind", ["still", "apart", "no number", "still angle"])
+def test_chains_that_stand_still_are_not_enough(kind):
+    """Of a constant the effective sample size is the number of draws, and of what is no number it is none."""
+    still = np.zeros((2, 400, 1))
+    apart = still + np.asarray([0.0, 1.0])[:, None, None]
+    positions = {"apart": apart, "no number": np.full_like(still, np.nan)}.get(kind, still)
+    if kind == "still angle":
+        target, _ = build_target(at_the_cut, at_the_cut_data())
+        moving = np.random.default_rng(0).normal(size=still.shape)
+        assert Enough(200, 1.1).reached(target, np.concatenate([1e-9 * moving, moving], axis=2))
+        positions = np.concatenate([still, moving], axis=2)
+    else:
+        target, _ = build_target(normal, normal_data())
+    assert not Enough(200, 1.1).reached(target, positions)
 
 
 def test_chunks_grow_where_they_take_no_time(capfd):
