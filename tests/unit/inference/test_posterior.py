@@ -88,6 +88,30 @@ def test_save_and_load_give_the_same(tmp_path):
     assert back.provenance == made.provenance
 
 
+def test_names_with_slashes_come_back_from_disk(tmp_path):
+    """As `numpyro.handlers.scope` makes them."""
+    made = Posterior(
+        draws={
+            "room/gain": RANDOM.normal(size=(2, 5, 3)) + 1j,
+            "room/level": RANDOM.normal(size=(2, 5)),
+            "room.level": RANDOM.normal(size=(2, 5, 2)),
+        },
+        log_likelihood={"room/h": RANDOM.normal(size=(2, 5, 3))},
+        axes={"room/gain": ("room/path",), "room/h": ("room/path",)},
+        latent=("room/gain", "room/level"),
+        coords={"room/path": np.arange(3) + 7},
+        extra={"mode.room/level": np.asarray(1.0)},
+    )
+    made.save(tmp_path / "p.nc")
+    back = Posterior.load(tmp_path / "p.nc")
+    assert (back.latent, back.axes) == (made.latent, made.axes)
+    for kind in ("draws", "log_likelihood", "coords", "extra"):
+        expected, found = getattr(made, kind), getattr(back, kind)
+        assert set(found) == set(expected)
+        for name, values in expected.items():
+            np.testing.assert_array_equal(found[name], values)
+
+
 def test_dimensions_are_named_and_kept_apart():
     dims = {name: v.dims for name, v in posterior().to_datatree()["posterior"].data_vars.items()}
     assert dims["level"] == ("chain", "draw")
