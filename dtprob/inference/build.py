@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections import OrderedDict
 from typing import Any
 
@@ -15,6 +13,7 @@ from jaxtyping import Array
 
 from dtprob.errors import InputError
 from dtprob.inference.circular import mean_direction
+from dtprob.inference.program import program_hash
 from dtprob.inference.target import Coordinates, Inputs, Target, free_value
 from dtprob.models.arguments import Data, Model, split_static
 from dtprob.models.declaration import declare, trace_model
@@ -97,15 +96,12 @@ def _program(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> st
         trace = trace_model(model, eqx.combine(arrays, static), key)
         samples = [site for site in trace.values() if site["type"] == "sample"]
         densities = [site["fn"].log_prob(site["value"]) for site in samples]
-        return [*densities, *(site["value"] for site in trace.values() if site["type"] == "deterministic")]
+        scales = [site["scale"] for site in samples if site["scale"] is not None]
+        others = [site["value"] for site in trace.values() if site["type"] == "deterministic"]
+        return [*densities, *scales, *others]
 
     shapes = jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype), arrays)
-    closed = jax.make_jaxpr(run)(shapes, jax.random.key(0))
-    digest = hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", str(closed.jaxpr)).encode())
-    for constant in closed.consts:
-        is_key = jnp.issubdtype(constant.dtype, jax.dtypes.prng_key)
-        digest.update(np.asarray(jax.random.key_data(constant) if is_key else constant).tobytes())
-    return digest.hexdigest()
+    return program_hash(jax.make_jaxpr(run)(shapes, jax.random.key(0)))
 
 
 def _make_target(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Target:

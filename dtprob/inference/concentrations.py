@@ -31,7 +31,7 @@ class LearnedConcentration:
         grid: the concentrations that are equally likely before the data.
 
     Raises:
-        InputError: concentrations that are not positive, or counts that do not fit.
+        InputError: concentrations that are not positive, or counts that do not fit or of what cannot happen.
     """
 
     allowed: Mapping[str, Bool[np.ndarray, "*row outcome"]]
@@ -47,6 +47,11 @@ class LearnedConcentration:
             if shape[len(shape) - mask.ndim :] != mask.shape:
                 remedy = "Count every entry of the table"
                 raise InputError(f"counts of {name!r}", f"(..., {mask.shape})", str(shape), remedy)
+            odd = np.argwhere(~((self.counts[name] == 0) | (mask & (np.asarray(self.counts[name]) > 0))))
+            if len(odd):
+                got = f"{self.counts[name][tuple(odd[0])]} at [{', '.join(map(str, odd[0]))}]"
+                expected = "zero or more, and zero where an outcome cannot happen"
+                raise InputError(f"counts of {name!r}", expected, got, "Correct them, or allow the outcome")
 
     def log_weights(self, site: str) -> Float[np.ndarray, "*batch grid"]:
         """Log-probability of each concentration of a table after the data."""

@@ -34,6 +34,8 @@ from dtprob.inference.posterior import Posterior, Values
 from dtprob.inference.run import Loop
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
+from dtprob.models.indices import check_indices
+from dtprob.models.support import check_support
 
 
 def fit_each(
@@ -70,6 +72,9 @@ def fit_each(
     chosen = _checked(resolve(engine, **settings), options)
     check_key(key)
     count = _count(data, own)
+    for number in _outermost(data, own, count):
+        check_indices(model, _member(data, own, number), f"data set {number}")
+    check_support(model, data, "data sets", own)
     target, members = _members(model, data, own, count)
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(count))
     if isinstance(chosen, Laplace):
@@ -168,10 +173,22 @@ def _count(data: Mapping[str, Any], own: Sequence[str]) -> int:
     return int(np.shape(leaves[0])[0])
 
 
+def _member(data: Mapping[str, Any], own: Sequence[str], number: int) -> dict[str, Any]:
+    """The data set of this number."""
+    return {n: jax.tree.map(lambda x: np.asarray(x)[number], v) if n in own else v for n, v in data.items()}
+
+
+def _outermost(data: Mapping[str, Any], own: Sequence[str], count: int) -> list[int]:
+    """Data sets that hold the largest or the smallest index of any column: where none is beyond an array, none is."""
+    columns = [np.asarray(leaf) for leaf in jax.tree.leaves([data[name] for name in own])]
+    whole = [column.reshape(count, -1) for column in columns if column.dtype.kind in "iu" and column.size]
+    found = [(int(w.max(axis=1).argmax()), int(w.min(axis=1).argmin())) for w in whole]
+    return sorted({0, *(number for pair in found for number in pair)})
+
+
 def _members(model: Model, data: Mapping[str, Any], own: Sequence[str], count: int) -> tuple[Target, Inputs]:
     """The target of any of the data sets, and their inputs: own arrays and units stacked."""
-    first = {n: jax.tree.map(lambda x: np.asarray(x)[0], v) if n in own else v for n, v in data.items()}
-    target, inputs = build_target(model, first)
+    target, inputs = build_target(model, _member(data, own, 0))
     stacked = {name: jax.tree.map(jnp.asarray, data[name]) for name in own}
     bare = Inputs(inputs.arrays | stacked, *(jnp.zeros((count, target.dimension)) + i for i in range(2)))
     keys = jnp.broadcast_to(jax.random.key(0), (count,))

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import abc
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import jax
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, unknown_name
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Model
 
@@ -112,6 +112,22 @@ def check_counts(engine: AbstractEngine, least: Mapping[str, int]) -> None:
         if value < bound:
             what = f"{name} of engine {engine.name}"
             raise InputError(what, f"{bound} or more", str(value), f"Give a larger {name}")
+
+
+def check_choice(engine: AbstractEngine, setting: str, choices: Sequence[str]) -> None:
+    """Check a setting of an engine that is one of a few words.
+
+    Args:
+        engine: the engine.
+        setting: its name.
+        choices: the words.
+
+    Raises:
+        InputError: it is another one.
+    """
+    value = getattr(engine, setting)
+    if value not in choices:
+        raise unknown_name(f"{setting} of engine {engine.name}", str(value), choices, "choice")
 
 
 def check_key(key: jax.Array) -> jax.Array:

@@ -34,6 +34,8 @@ class Enough:
     def reached(self, target: Target, positions: Float[np.ndarray, "chain draw dimension"]) -> bool:
         """Whether all coordinates suffice; of an angle its cosine and its sine.
 
+        A coordinate that never moves, or is not a number, does not: there the effective sample size means nothing.
+
         Args:
             target: what the chains are of.
             positions: the draws so far.
@@ -41,10 +43,14 @@ class Enough:
         from arviz_stats.base import array_stats  # noqa: PLC0415  (takes a second)
 
         stats = cast("Any", array_stats)
-        for values in _coordinates(target, positions):
-            if stats.ess(values, chain_axis=0, draw_axis=1) < self.ess:
-                return False
-            if len(values) > 1 and stats.rhat(values, chain_axis=0, draw_axis=1) > self.rhat:
+        for parts in _coordinates(target, positions):
+            moving = [values for values in parts if np.ptp(values) > 0]
+            for values in moving:
+                if not stats.ess(values, chain_axis=0, draw_axis=1) >= self.ess:
+                    return False
+                if len(values) > 1 and not stats.rhat(values, chain_axis=0, draw_axis=1) <= self.rhat:
+                    return False
+            if not moving:
                 return False
         return True
 
@@ -52,9 +58,9 @@ class Enough:
 NEVER = Enough(0, 1.0)
 
 
-def _coordinates(target: Target, positions: np.ndarray) -> Iterator[np.ndarray]:
+def _coordinates(target: Target, positions: np.ndarray) -> Iterator[tuple[np.ndarray, ...]]:
+    """What is looked at of each coordinate."""
     for index in target.angles:
-        yield np.cos(positions[..., index])
-        yield np.sin(positions[..., index])
+        yield np.cos(positions[..., index]), np.sin(positions[..., index])
     for index in target.linear:
-        yield positions[..., index]
+        yield (positions[..., index],)

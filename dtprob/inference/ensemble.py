@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -23,7 +23,16 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from dtprob.errors import InputError
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
+from dtprob.inference.circular import wrap
+from dtprob.inference.engine import (
+    DEFAULT,
+    AbstractEngine,
+    Answer,
+    RunOptions,
+    check_choice,
+    check_counts,
+    check_key,
+)
 from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.modes import find_mode
 from dtprob.inference.optimise import minimise
@@ -109,6 +118,7 @@ class Ensemble(AbstractEngine):
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
         check_counts(self, {"members": 1, "starts": 1, "max_steps": 1})
+        check_choice(self, "resample", ("auto", *get_args(Scheme.__value__)))
         check_key(key)
         target, inputs = build_target(model, data)
         is_point = self.base == "point"
@@ -265,6 +275,10 @@ def _block(  # noqa: PLR0917
 
 
 def _prior_shift(target: Target, key: PRNGKeyArray, inputs: Inputs) -> Float[Array, " dimension"]:
-    """How far a member's prior is from the model's: mean zero, and the prior's own covariance."""
+    """How far a member's prior is from the model's: mean zero, and the prior's own covariance.
+
+    Draws of an angle on both sides of +-pi are close to each other.
+    """
     first, second = (target.prior_draw(k, inputs) for k in jax.random.split(key))
-    return (first - second) / jnp.sqrt(2.0)
+    apart = first - second
+    return jnp.where(target.circular, wrap(apart), apart) / jnp.sqrt(2.0)

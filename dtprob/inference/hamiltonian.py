@@ -5,12 +5,12 @@ from __future__ import annotations
 import abc
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, get_args
 
 import jax
 
 from dtprob.inference.chains import ChainMethod
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts
+from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_choice, check_counts
 from dtprob.inference.enough import Enough
 from dtprob.inference.kernel import Kernel
 from dtprob.inference.posterior import Posterior
@@ -61,9 +61,10 @@ class AbstractHamiltonian(AbstractEngine):
         """How long a run is.
 
         Raises:
-            InputError: a setting is too small.
+            InputError: a setting is too small, or no choice.
         """
         check_counts(self, {"chains": 1, "warmup": 0, "draws": 1, **self.least})
+        check_choice(self, "chain_method", get_args(ChainMethod.__value__))
         enough = Enough(self.enough_ess, self.enough_rhat)
         return Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial, enough)
 

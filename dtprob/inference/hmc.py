@@ -19,10 +19,12 @@ import jax.numpy as jnp
 from blackjax.mcmc import hmc
 from jaxtyping import Array, PRNGKeyArray
 
+from dtprob.errors import InputError
 from dtprob.inference.blackjax_kernel import BlackJAXKernel
 from dtprob.inference.hamiltonian import AbstractHamiltonian
 
 _GOLDEN = 2_654_435_769  # 2^32 over the golden ratio
+_MOST = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -70,5 +72,12 @@ class HMC(AbstractHamiltonian):
     leapfrog: int = 8
 
     def kernel(self, warmup: int) -> BlackJAXKernel:
-        """BlackJAX's transition."""
+        """BlackJAX's transition.
+
+        Raises:
+            InputError: more leapfrog steps than the lengths are counted in.
+        """
+        if self.leapfrog > _MOST:
+            got, remedy = str(self.leapfrog), "Take another engine, such as nuts"
+            raise InputError(f"leapfrog of engine {self.name}", f"at most {_MOST}", got, remedy)
         return BlackJAXKernel(SharedLength(self.leapfrog), warmup, self.target_accept, self.dense_mass)

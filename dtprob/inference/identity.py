@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -13,6 +11,7 @@ from jaxtyping import PRNGKeyArray
 
 from dtprob.inference.assemble import provenance
 from dtprob.inference.engine import AbstractEngine
+from dtprob.inference.program import program_hash
 from dtprob.inference.target import Inputs, Target
 
 
@@ -34,6 +33,5 @@ def identity(
 
 
 def _density_hash(target: Target, inputs: Inputs) -> str:
-    """SHA-256 of the log density's program, memory addresses left out."""
-    program = str(jax.make_jaxpr(target.log_density)(jnp.zeros(target.dimension), inputs))
-    return hashlib.sha256(re.sub(r"0x[0-9a-f]+", "", program).encode()).hexdigest()
+    """Hash of the log density's program, with what the model holds besides its data."""
+    return program_hash(jax.make_jaxpr(target.log_density)(jnp.zeros(target.dimension), inputs))

@@ -14,17 +14,23 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
+from numpyro.distributions import constraints
 
 from dtprob.inference.relaxation import Layout, Resultants
 from dtprob.inference.target import Inputs, Target
+from dtprob.models.declaration import base_constraint
 
 _NORMAL = ("Normal", "ComplexNormal")
+_WHOLE = (constraints.real, constraints.complex)
 _ITERATIONS = 200
 
 
 def is_gaussian(target: Target) -> bool:
-    """Whether every observed site is normal, real or complex."""
-    return all(site.distribution in _NORMAL for site in target.declaration.observed.values())
+    """Whether every observed site is normal, real or complex; one that a normal is the base of, as LogNormal, is not."""
+    return all(
+        site.distribution in _NORMAL and base_constraint(site.support) in _WHOLE
+        for site in target.declaration.observed.values()
+    )
 
 
 def least_squares_start(

@@ -10,7 +10,15 @@ import jax
 
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
+from dtprob.inference.engine import (
+    DEFAULT,
+    AbstractEngine,
+    Answer,
+    RunOptions,
+    check_choice,
+    check_counts,
+    check_key,
+)
 from dtprob.inference.modes import find_mode
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Model
@@ -45,6 +53,7 @@ class Point(AbstractEngine):
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
         check_counts(self, {"starts": 1, "max_steps": 1})
+        check_choice(self, "objective", ("map", "maximum_likelihood"))
         target, inputs = build_target(model, data)
         mode = find_mode(
             target,

@@ -96,7 +96,7 @@ class Posterior:
     def flat(self, site: str) -> np.ndarray:
         """All draws of a site, (chain * draw, *event)."""
         value = self.draws[site]
-        return value.reshape(-1, *value.shape[2:])
+        return value.reshape(self.chains * self.draws_per_chain, *value.shape[2:])
 
     def sample(self, key: PRNGKeyArray, n: int) -> Values:
         """`n` draws, {site: (n, *event)}: without replacement while there are enough, else with.

@@ -246,14 +246,16 @@ def _temper(  # noqa: PLR0917
 def _covariance(target: Target, swarm: Swarm) -> Float[Array, " dimension *columns"]:
     """Covariance of the weighted particles, angles as they stand about their mean direction.
 
-    Its diagonal where there are too few particles for the whole.
+    Its diagonal where there are too few particles for the whole. A draw from the prior that was rounded to the edge of
+    its support stands at infinity; it counts as one at the prior's median, so that the others can move.
     """
     count, dimension = swarm.particles.shape
     weights = swarm.weights[:, None]
-    centre = jnp.sum(weights * swarm.particles, axis=0)
-    direction = jnp.arctan2(*(jnp.sum(weights * f(swarm.particles), axis=0) for f in (jnp.sin, jnp.cos)))
+    particles = jnp.where(jnp.isfinite(swarm.particles), swarm.particles, 0.0)
+    centre = jnp.sum(weights * particles, axis=0)
+    direction = jnp.arctan2(*(jnp.sum(weights * f(particles), axis=0) for f in (jnp.sin, jnp.cos)))
     centre = jnp.where(target.circular, direction, centre)
-    offset = swarm.particles - centre
+    offset = particles - centre
     offset = jnp.where(target.circular, wrap(offset), offset)
     variance = jnp.sum(weights * offset**2, axis=0) + jnp.finfo(offset.dtype).eps
     if count < _PER_COORDINATE * dimension:

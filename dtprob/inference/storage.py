@@ -1,7 +1,7 @@
 """A posterior as an ArviZ DataTree and as a NetCDF file.
 
 The file is the DataTree, so that ArviZ and xarray read it as it is. What a DataTree cannot hold (complex
-numbers, two sizes of one axis) is written in another form, with attributes that say how to go back.
+numbers, two sizes of one axis, slashes in names) is written in another form, with attributes that say how to go back.
 """
 
 from __future__ import annotations
@@ -36,13 +36,15 @@ def to_datatree(posterior: Posterior) -> xr.DataTree:
         "extra": _dataset(posterior.extra, {}, (), {}),
     }
     filled = {name: dataset for name, dataset in groups.items() if name == "posterior" or dataset.data_vars}
-    tree = xr.DataTree.from_dict(filled)
+    written = _without_slashes(filled.values())
+    tree = xr.DataTree.from_dict({name: _renamed(dataset, written) for name, dataset in filled.items()})
     tree.attrs = {
         "format": FORMAT,
         "provenance": json.dumps(posterior.provenance, sort_keys=True),
         "axes": json.dumps({name: list(names) for name, names in axes.items()}),
         "latent": json.dumps(list(posterior.latent)),
         "circular": json.dumps(list(posterior.circular)),
+        "names": json.dumps({new: old for old, new in written.items()}),
     }
     return tree
 
@@ -81,28 +83,44 @@ def from_datatree(tree: xr.DataTree, what: str = "data tree") -> Posterior:
     if found != FORMAT:
         remedy = "Read it with the version of dtprob that wrote it, or with arviz"
         raise InputError(what, f"format '{FORMAT}'", repr(found), remedy)
+    names = json.loads(tree.attrs.get("names", "{}"))
+    groups = {group: _renamed(child.to_dataset(), names) for group, child in tree.children.items()}
+    arrays = {group: _arrays(dataset) for group, dataset in groups.items()}
     coords = {
         str(name): value.values
-        for group in tree.children.values()
-        for name, value in group.to_dataset().coords.items()
+        for dataset in groups.values()
+        for name, value in dataset.coords.items()
         if name not in _LEADING
     }
     return Posterior(
-        draws=_group(tree, "posterior"),
-        sample_stats=_group(tree, "sample_stats"),
-        log_likelihood=_group(tree, "log_likelihood"),
-        observed=_group(tree, "observed_data"),
+        draws=arrays.get("posterior", {}),
+        sample_stats=arrays.get("sample_stats", {}),
+        log_likelihood=arrays.get("log_likelihood", {}),
+        observed=arrays.get("observed_data", {}),
         axes={name: tuple(names) for name, names in json.loads(tree.attrs["axes"]).items()},
         latent=tuple(json.loads(tree.attrs["latent"])),
         circular=tuple(json.loads(tree.attrs["circular"])),
         coords=coords,
-        extra=_group(tree, "extra"),
+        extra=arrays.get("extra", {}),
         provenance=json.loads(tree.attrs["provenance"]),
     )
 
 
-def _group(tree: xr.DataTree, name: str) -> dict[str, np.ndarray]:
-    return _arrays(tree[name].to_dataset()) if name in tree.children else {}
+def _without_slashes(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
+    """How names with slashes, as of sites within `numpyro.handlers.scope`, are written: a tree cannot hold them."""
+    names = {str(name) for dataset in datasets for name in (*dataset.variables, *dataset.dims)}
+    written: dict[str, str] = {}
+    for name in sorted(name for name in names if "/" in name):
+        free = name.replace("/", ".")
+        while free in names:
+            free += "."
+        names.add(free)
+        written[name] = free
+    return written
+
+
+def _renamed(dataset: xr.Dataset, names: Mapping[str, str]) -> xr.Dataset:
+    return dataset.rename({o: n for o, n in names.items() if o in dataset.variables or o in dataset.dims})
 
 
 def _dataset(

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,15 @@ from scipy.special import logsumexp
 
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
+from dtprob.inference.engine import (
+    DEFAULT,
+    AbstractEngine,
+    Answer,
+    RunOptions,
+    check_choice,
+    check_counts,
+    check_key,
+)
 from dtprob.inference.guide import (
     Anchor,
     Family,
@@ -118,6 +126,7 @@ class SVI(AbstractEngine):
         """Infer; see `AbstractEngine`."""
         least = ("draws", "rank", "steps", "falls", "particles", "starts")
         check_counts(self, dict.fromkeys(least, 1))
+        check_choice(self, "guide", ("auto", *get_args(Family.__value__)))
         draw_key = jax.random.fold_in(check_key(key), 2)
         target, inputs = build_target(model, data)
         family = self._family(target)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Final
 
 import equinox as eqx
@@ -22,13 +22,14 @@ _ANY: Final = ("Real", "Complex", "Circular", "Sphere", "Simplex")
 """Supports of which no value is refused: all numbers, angles counted from anywhere, and what sums to 1 but for rounding."""
 
 
-def check_support(model: Model, data: Data, where: str = "data") -> None:
+def check_support(model: Model, data: Data, where: str = "data", own: Sequence[str] = ()) -> None:
     """Run the model at draws from its prior, and look whether its observed distributions can take the values of the data.
 
     Args:
         model: a NumPyro model.
         data: its arguments by name.
         where: what to call them in an error.
+        own: arguments that hold those of many data sets, stacked on a leading axis.
 
     Raises:
         InputError: a value that counts is outside the support of its distribution at each draw.
@@ -47,18 +48,25 @@ def check_support(model: Model, data: Data, where: str = "data") -> None:
         return {n: (value, _allows(bounded[n]["fn"], value)) for n, value in values.items()}
 
     keys = jax.random.split(jax.random.key(0), _DRAWS)
+    axes = {name: 0 if name in own else None for name in arrays}
     with numpyro.validation_enabled(is_validate=False):  # which makes densities at the ends infinite
         try:
-            if not jax.eval_shape(one, arrays, keys[0]):
+            if not jax.eval_shape(_each(one, axes), arrays, keys[0]):
                 return
         except (*NOT_TRACED, NotImplementedError):
             return  # which `declare` tells
-        found = jax.jit(lambda arrays, keys: jax.lax.map(lambda key: one(arrays, key), keys))(arrays, keys)
+        looked = jax.jit(lambda arrays, keys: jax.lax.map(lambda key: _each(one, axes)(arrays, key), keys))
+        found = looked(arrays, keys)
     for name, family in families.items():  # the first of the model is named
         values, allowed = found[name]
         refused = ~np.asarray(allowed).any(axis=0)
         if refused.any():
             raise _refusal(f"{where}, observed site {name!r}", family, np.asarray(values[0]), refused)
+
+
+def _each(one: Callable[..., Any], axes: Mapping[str, int | None]) -> Callable[..., Any]:
+    """A function of arrays and a key for each data set, where some arrays have an axis of data sets."""
+    return jax.vmap(one, in_axes=(dict(axes), None)) if 0 in axes.values() else one
 
 
 def _ends(support: Any) -> tuple[Any, ...] | None:

@@ -59,6 +59,15 @@ def test_a_batch_is_posteriors_of_their_own():
     assert law.sample(jax.random.key(1), 7)["t"].shape == (7, 2, 2, 3)
 
 
+@pytest.mark.parametrize("count", [1.0, -1.0, np.nan])
+def test_counts_of_what_cannot_happen_are_refused(count):
+    """No concentration explains them, so that all weights would be no numbers."""
+    counts = COUNTS.copy()
+    counts[0, 2] = count
+    with pytest.raises(InputError, match=r"counts of 't': .* at \[0, 2\]"):
+        LearnedConcentration({"t": ALLOWED}, {"t": counts})
+
+
 @pytest.mark.parametrize(("counts", "grid"), [(COUNTS[:1], (0.1,)), (COUNTS, (0.0, 1.0)), (COUNTS, ())])
 def test_what_cannot_be_is_refused(counts, grid):
     with pytest.raises(InputError):

@@ -2,6 +2,8 @@
 
 import jax
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 
 from dtprob.errors import InputError
@@ -93,3 +95,21 @@ def test_what_it_refuses(tmp_path):
         fit_each(normal, data, ["z"], key=KEY)
     with pytest.raises(InputError, match="one common length, 1 or more, got a scalar"):
         fit_each(normal, data, ["noise"], key=KEY)
+
+
+def test_data_that_the_model_cannot_take_are_refused_wherever_they_are():
+    """As by `fit`: NumPyro gives a density all the same, and JAX takes the last entry."""
+
+    def counted(group, y=None):
+        with numpyro.plate("group", 2):
+            level = numpyro.sample("level", dist.LogNormal(0.0, 1.0))
+        with numpyro.plate("row", 3):
+            numpyro.sample("y", dist.Gamma(2.0, level[group]), obs=y)
+
+    y, group = np.ones((4, 3)), np.tile([0, 1, 1], (4, 1))
+    bad, beyond = y.copy(), group.copy()
+    bad[2, 1], beyond[3, 0] = -1.0, 2
+    with pytest.raises(InputError, match=r"observed site 'y': expected values that Gamma.*-1\. at \[2, 1\]"):
+        fit_each(counted, {"group": group, "y": bad}, ["group", "y"], key=KEY)
+    with pytest.raises(InputError, match="data set 3 'group': expected indices from 0 to 1"):
+        fit_each(counted, {"group": beyond, "y": y}, ["group", "y"], key=KEY)

@@ -10,6 +10,8 @@ from scipy import stats
 
 from dtprob.errors import InputError
 from dtprob.inference import Ensemble
+from dtprob.inference.build import build_target
+from dtprob.inference.resample import chosen_scheme
 from tests.unit.inference.examples import (
     at_the_cut,
     at_the_cut_data,
@@ -90,6 +92,40 @@ def test_angles_and_discrete_data():
     assert abs(error) < 0.1
     with pytest.raises(InputError, match=r"observed sites that are normal.*'y' \(Bernoulli"):
         Ensemble(resample="noise")(KEY, logistic, logistic_data())
+
+
+def test_an_angle_whose_prior_lies_across_the_cut_has_the_spread_of_its_prior():
+    """Without data members are draws of the prior, here within .2 rad or so of pi."""
+
+    def untold(y=None):
+        numpyro.sample("angle", dist.VonMises(jnp.pi, 25.0))
+        numpyro.sample("y", dist.Normal(0.0, 1.0), obs=y)
+
+    posterior = Ensemble(members=64, resample="none")(KEY, untold, {"y": jnp.zeros(())})
+    error = np.angle(np.exp(1j * (posterior.draws["angle"] - np.pi)))
+    assert np.std(error) == pytest.approx(25**-0.5, rel=0.3)
+
+
+LAWS = {
+    "LogNormal": lambda level: dist.LogNormal(level, 1.0),
+    "FoldedDistribution": lambda level: dist.FoldedDistribution(dist.Normal(level, 1.0)),
+    "TruncatedNormal": lambda level: dist.TruncatedNormal(level, 1.0, low=0.0),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_no_noise_is_added_to_data_that_only_have_a_normal_base(name):
+    """With noise they would leave their support, where there is no density."""
+
+    def positive(y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("row", 12):
+            numpyro.sample("y", LAWS[name](level), obs=y)
+
+    target, _ = build_target(positive, {"y": jnp.linspace(0.05, 2.0, 12)})
+    assert chosen_scheme(target, "auto", point=True) == "weights"
+    with pytest.raises(InputError, match="observed sites that are normal"):
+        chosen_scheme(target, "noise", point=True)
 
 
 def test_any_engine_can_be_the_base():

@@ -10,6 +10,7 @@ import pytest
 import dtprob
 from dtprob.errors import InputError
 from dtprob.inference import ENGINES, AbstractEngine, Laplace, Point, fit, resolve
+from dtprob.inference.build import build_target
 from tests.unit.inference.examples import normal, normal_data, normal_posterior
 
 KEY = jax.random.key(0)
@@ -74,6 +75,37 @@ def test_a_model_that_reads_something_that_has_changed_is_another_one():
         model.deviation = deviation
         found = fit(model, data, engine="laplace", key=jax.random.key(0))
         assert float(np.std(found.draws["level"])) == pytest.approx(deviation / np.sqrt(50), rel=0.1)
+
+
+def test_a_model_whose_scale_has_changed_is_another_one():
+    class Scaled:
+        weight = 1.0
+
+        def __call__(self, y=None):
+            level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+            with numpyro.handlers.scale(scale=self.weight), numpyro.plate("row", 50):
+                numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+    model, data = Scaled(), {"y": jnp.linspace(-0.1, 0.1, 50)}
+    first, _ = build_target(model, data)
+    assert build_target(model, data)[0] is first
+    model.weight = 100.0
+    assert build_target(model, data)[0] is not first
+
+
+@pytest.mark.parametrize(
+    ("engine", "setting", "value", "remedy"),
+    [
+        ("point", "objective", "max_likelihood", "Did you mean 'maximum_likelihood'"),
+        ("point", "objective", "density", "choice"),
+        ("svi", "guide", "full", "Did you mean 'full_rank'"),
+        ("ensemble", "resample", "cluster", "Did you mean 'clusters'"),
+        ("nuts", "chain_method", "vectorised", "Did you mean 'vectorized'"),
+    ],
+)
+def test_a_setting_that_is_no_choice_is_refused(engine, setting, value, remedy):
+    with pytest.raises(InputError, match=f"{setting} of engine {engine}.*{remedy}"):
+        fit(normal, normal_data(), engine=engine, key=KEY, **{setting: value})
 
 
 @pytest.mark.parametrize("engine", ["nuts", "blackjax_nuts"])

@@ -54,6 +54,12 @@ def test_sample():
         made.sample(KEY, 0)
 
 
+def test_a_site_without_entries_is_sampled_like_any_other():
+    made = Posterior(draws={"level": np.zeros((2, 5)), "empty": np.zeros((2, 5, 0, 3))})
+    assert made.flat("empty").shape == (10, 0, 3)
+    assert made.sample(KEY, 4)["empty"].shape == (4, 0, 3)
+
+
 def test_point_mass_is_the_same_kind_of_thing():
     point = PointMass({"x": np.arange(3.0), "s": 2.0})
     assert isinstance(point, Sampler)
@@ -80,6 +86,30 @@ def test_save_and_load_give_the_same(tmp_path):
             np.testing.assert_array_equal(after[name], value)
     assert (back.axes, back.circular, back.latent) == (made.axes, made.circular, made.latent)
     assert back.provenance == made.provenance
+
+
+def test_names_with_slashes_come_back_from_disk(tmp_path):
+    """As `numpyro.handlers.scope` makes them."""
+    made = Posterior(
+        draws={
+            "room/gain": RANDOM.normal(size=(2, 5, 3)) + 1j,
+            "room/level": RANDOM.normal(size=(2, 5)),
+            "room.level": RANDOM.normal(size=(2, 5, 2)),
+        },
+        log_likelihood={"room/h": RANDOM.normal(size=(2, 5, 3))},
+        axes={"room/gain": ("room/path",), "room/h": ("room/path",)},
+        latent=("room/gain", "room/level"),
+        coords={"room/path": np.arange(3) + 7},
+        extra={"mode.room/level": np.asarray(1.0)},
+    )
+    made.save(tmp_path / "p.nc")
+    back = Posterior.load(tmp_path / "p.nc")
+    assert (back.latent, back.axes) == (made.latent, made.axes)
+    for kind in ("draws", "log_likelihood", "coords", "extra"):
+        expected, found = getattr(made, kind), getattr(back, kind)
+        assert set(found) == set(expected)
+        for name, values in expected.items():
+            np.testing.assert_array_equal(found[name], values)
 
 
 def test_dimensions_are_named_and_kept_apart():

@@ -4,12 +4,16 @@ import json
 
 import jax
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 
 from dtprob.errors import InputError
 from dtprob.inference import HMC, NUTS, BlackJAXNUTS, RunOptions, checkpoint, summary
 from dtprob.inference import run as run_module
 from dtprob.inference.build import build_target
+from dtprob.inference.enough import Enough
+from dtprob.inference.identity import identity
 from tests.unit.inference.examples import (
     at_the_cut,
     at_the_cut_data,
@@ -133,9 +137,6 @@ def test_a_checkpoint_of_another_run_is_refused(tmp_path):
 
 
 def test_a_checkpoint_of_another_version_or_model_is_refused(tmp_path, monkeypatch):
-    import numpyro
-    import numpyro.distributions as dist
-
     path = tmp_path / "run.h5"
     options = RunOptions(checkpoint=path, chunk=50, resume=True)
     NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
@@ -154,6 +155,25 @@ def test_a_checkpoint_of_another_version_or_model_is_refused(tmp_path, monkeypat
     path.write_text("no checkpoint")
     with pytest.raises(InputError, match="expected an HDF5 file"):
         NUTS(**SHORT)(KEY, normal, normal_data(), options=options)
+
+
+def test_a_checkpoint_of_a_model_that_reads_something_else_by_now_is_refused():
+    """What a model holds besides its data counts as what it computes."""
+
+    class Reading:
+        offset = np.zeros(12)
+
+        def __call__(self, y=None):
+            level = numpyro.sample("level", dist.Normal(1.0, 3.0))
+            with numpyro.plate("row", 12):
+                numpyro.sample("y", dist.Normal(level + self.offset, 1.0), obs=y)
+
+    model, data, known = Reading(), {"y": np.ones(12)}, []
+    for offset in (0.0, 0.0, 1.0):
+        model.offset = np.full(12, offset)
+        known.append(identity(*build_target(model, data), NUTS(), KEY))
+    assert known[0] == known[1]
+    assert known[0]["density"] != known[2]["density"]
 
 
 def test_without_resume_an_old_checkpoint_is_replaced(tmp_path):
@@ -189,6 +209,22 @@ def test_stops_early_once_there_is_enough(tmp_path):
         assert same(stopped, engine(KEY, normal, data, options=options))
     never = NUTS(warmup=100, draws=300, chains=2, enough_ess=10_000)(KEY, normal, data)
     assert never.draws_per_chain == 300
+
+
+@pytest.mark.parametrize("kind", ["still", "apart", "no number", "still angle"])
+def test_chains_that_stand_still_are_not_enough(kind):
+    """Of a constant the effective sample size is the number of draws, and of what is no number it is none."""
+    still = np.zeros((2, 400, 1))
+    apart = still + np.asarray([0.0, 1.0])[:, None, None]
+    positions = {"apart": apart, "no number": np.full_like(still, np.nan)}.get(kind, still)
+    if kind == "still angle":
+        target, _ = build_target(at_the_cut, at_the_cut_data())
+        moving = np.random.default_rng(0).normal(size=still.shape)
+        assert Enough(200, 1.1).reached(target, np.concatenate([1e-9 * moving, moving], axis=2))
+        positions = np.concatenate([still, moving], axis=2)
+    else:
+        target, _ = build_target(normal, normal_data())
+    assert not Enough(200, 1.1).reached(target, positions)
 
 
 def test_chunks_grow_where_they_take_no_time(capfd):

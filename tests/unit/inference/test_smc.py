@@ -10,6 +10,8 @@ from scipy import special, stats
 
 from dtprob.errors import InputError
 from dtprob.inference import SMC, summary
+from dtprob.inference.build import build_target
+from dtprob.inference.smc import Swarm, _covariance
 from tests.unit.inference.examples import at_the_cut, at_the_cut_data, normal, normal_data, normal_posterior
 
 KEY = jax.random.key(6)
@@ -70,6 +72,17 @@ def test_each_mode_keeps_its_share():
     assert np.abs(posterior.draws["level"]).mean() == pytest.approx(
         np.sum(np.abs(x) * density) / density.sum(), abs=0.01
     )
+
+
+def test_a_particle_at_the_edge_of_its_support_does_not_stop_the_others():
+    """As a draw of Gamma(.01) that was rounded to zero; its weight is zero once the likelihood counts."""
+    target, _ = build_target(normal, normal_data())
+    particles = jnp.asarray([-jnp.inf, *np.random.default_rng(0).normal(size=99)])[:, None]
+    for first in (0.01, 0.0):
+        weights = jnp.full(100, (1 - first) / 99).at[0].set(first)
+        covariance = _covariance(target, Swarm(particles, weights, *[jnp.zeros(())] * 7))
+        expected = float(np.var(particles[1:]))
+        assert float(covariance[0, 0]) == pytest.approx(expected, rel=0.05)
 
 
 def test_what_it_cannot_do_is_an_error():
