@@ -9,6 +9,7 @@ from typing import Any, ClassVar, get_args
 
 import jax
 
+from dtprob.errors import InputError
 from dtprob.inference.chains import ChainMethod
 from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_choice, check_counts
 from dtprob.inference.enough import Enough
@@ -63,6 +64,9 @@ class AbstractHamiltonian(AbstractEngine):
         Raises:
             InputError: a setting is too small, or no choice.
         """
+        if not 0 < self.target_accept < 1:
+            what, got = f"target_accept of engine {self.name}", f"{self.target_accept:g}"
+            raise InputError(what, "a rate between 0 and 1", got, "Give a rate, such as 0.8")
         check_counts(self, {"chains": 1, "warmup": 0, "draws": 1, **self.least})
         check_choice(self, "chain_method", get_args(ChainMethod.__value__))
         enough = Enough(self.enough_ess, self.enough_rhat)

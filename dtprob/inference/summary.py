@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 
-from dtprob.errors import unknown_name
+from dtprob.errors import InputError, unknown_name
 from dtprob.inference.circular import arc_interval, mean_direction, resultant_length
 from dtprob.inference.posterior import Posterior
 
@@ -36,8 +36,11 @@ def summary(
         probability: of the intervals.
 
     Raises:
-        InputError: no such site.
+        InputError: no such site, or a probability outside of (0, 1).
     """
+    if not 0 < probability < 1:
+        expected, remedy = "a probability between 0 and 1", "Give 0.9 for 90% intervals"
+        raise InputError("probability of a summary", expected, f"{probability:g}", remedy)
     import pandas as pd  # noqa: PLC0415  (takes half a second)
 
     chosen = list(sites if sites is not None else posterior.latent or posterior.draws)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.constants import speed_of_light
 
-from dtprob.errors import unknown_name
+from dtprob.errors import InputError, unknown_name
 from dtprob.raytracing.geometry import Geometry, unfold
 from dtprob.raytracing.paths import NONE, PathSet, validate
 from dtprob.raytracing.pattern import PATTERNS, field_vector, slant_angle
@@ -66,11 +66,15 @@ class Antenna:
     polarization: str | float
     orientation: Float[np.ndarray, "*link 3"] | tuple[float, float, float]
 
-    def checked(self) -> "Antenna":
-        """The antenna itself; raises InputError when its pattern or polarisation does not exist."""
+    def checked(self, n_link: int) -> "Antenna":
+        """The antenna itself; raises InputError when its pattern or polarisation does not exist, or its angles do not fit."""
         if self.pattern not in PATTERNS:
             raise unknown_name("antenna pattern", self.pattern, PATTERNS, "pattern")
         slant_angle(self.polarization)
+        shape = np.shape(self.orientation)
+        if shape not in {(3,), (n_link, 3)}:
+            expected = f"three angles in rad, or three for each of {n_link} links"
+            raise InputError("orientation of an antenna", expected, f"shape {shape}", "Correct it")
         return self
 
     def field(

@@ -92,7 +92,7 @@ def read_floorplan(file: str | os.PathLike[str]) -> Floorplan:
     if not path.is_file():
         raise InputError(f"floor plan {path}", "a JSON file", "no such file", "Correct the path")
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(path.read_text(encoding="utf-8-sig"))
         walls = np.asarray(content["walls_xyxy"], np.float64)
         pieces = [
             (str(one["kind"]), np.asarray(one["polygon_m"], np.float64))

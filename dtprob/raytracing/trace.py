@@ -153,9 +153,9 @@ def trace(
     _check_request(tx, rx, max_depth, samples, diffraction=diffraction, diffuse_reflection=diffuse_reflection)
     carrier = _carrier(scene, frequency)
     settings = Settings(max_depth, refraction, samples, seed, max_paths)
-    sending = Antenna(tx_pattern, polarization, tx_orientation).checked()
+    sending = Antenna(tx_pattern, polarization, tx_orientation).checked(len(tx))
     other = polarization if rx_polarization is None else rx_polarization
-    receiving = Antenna(rx_pattern, other, rx_orientation).checked()
+    receiving = Antenna(rx_pattern, other, rx_orientation).checked(len(tx))
     objects = describe_objects(scene)
     flat = _trace_links(scene, tx, rx, settings)
     if not allow_empty:

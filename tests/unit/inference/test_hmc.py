@@ -23,3 +23,7 @@ def test_lengths_that_cannot_be_counted_are_refused():
     assert steps.max() > 0.99 * most
     with pytest.raises(InputError, match="leapfrog of engine hmc: expected at most 65536, got 65537"):
         HMC(leapfrog=most + 1).kernel(0)
+    with pytest.raises(
+        InputError, match="target_accept of engine hmc: expected a rate between 0 and 1, got 80"
+    ):
+        HMC(target_accept=80).schedule()

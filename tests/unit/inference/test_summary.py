@@ -57,6 +57,8 @@ def test_complex_sites_in_parts_and_unknown_sites():
     assert list(summary(posterior(), ["gain"]).index) == ["gain.real", "gain.imag"]
     with pytest.raises(InputError, match="Did you mean 'phase'"):
         summary(posterior(), ["phases"])
+    with pytest.raises(InputError, match="a probability between 0 and 1, got 90"):
+        summary(posterior(), probability=90)
 
 
 def test_one_chain_and_one_draw_have_no_quality():

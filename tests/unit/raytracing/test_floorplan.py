@@ -129,6 +129,8 @@ def test_reading_a_plan(tmp_path):
     plan = read_floorplan(file)
     assert np.array_equal(plan.walls, WALLS)
     assert [piece.kind for piece in plan.furniture] == ["bed"]
+    file.write_text(file.read_text(), encoding="utf-8-sig")  # as some editors write
+    assert np.array_equal(read_floorplan(file).walls, WALLS)
     for text in (
         "{",
         "[]",

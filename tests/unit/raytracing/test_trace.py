@@ -220,6 +220,7 @@ REFUSED = {
     "diffuse": ({"diffuse_reflection": True, "diffraction": True}, "diffraction and diffuse_reflection"),
     "pattern": ({"tx_pattern": "dipol"}, "Did you mean 'dipole'"),
     "polarization": ({"polarization": "VH"}, "polarization of a single element"),
+    "orientation": ({"rx_orientation": np.zeros((2, 3))}, r"three for each of 1 links, got shape \(2, 3\)"),
     "depth": ({"max_depth": -1}, "max_depth of 0 or more"),
     "carrier": ({"frequency": 3e9}, r"2.8e\+10 Hz, got 3e\+09 Hz"),
 }
