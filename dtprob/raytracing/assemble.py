@@ -67,7 +67,7 @@ class Antenna:
     orientation: Float[np.ndarray, "*link 3"] | tuple[float, float, float]
 
     def checked(self, n_link: int) -> "Antenna":
-        """The antenna itself; raises InputError when its pattern or polarisation does not exist, or its angles do not fit."""
+        """The antenna itself; raises InputError when its pattern or polarisation does not exist, its angles do not fit."""
         if self.pattern not in PATTERNS:
             raise unknown_name("antenna pattern", self.pattern, PATTERNS, "pattern")
         slant_angle(self.polarization)
