@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 
 import jax
 import numpy as np
@@ -66,7 +67,7 @@ class Scores:
         size = float(self.u[own]) / max(float(self.information[own, own]), 1e-300)
         return abs(size) / float(scales(self.effects[k])[sizes(self.effects[k])][0])
 
-    @property
+    @cached_property
     def log_bayes_factor(self) -> np.ndarray:
         """Of each effect, the scale of its prior mixed, see `dtprob.gap.fitting.plausible`, its place paid for."""
         pairs = zip(self.effects, self.groups, strict=True)
