@@ -167,7 +167,9 @@ def test_random_levels_are_a_variance_effect():
     assert found.verdict == "LISTED"
     assert found.causes[0].effects == ("jitter",)
     size = found.causes[0].size[0]
-    assert size.low < np.sqrt(np.mean(shift**2)) < size.high  # twelve draws can be far from the 0.8 that they are of
+    assert (
+        size.low < np.sqrt(np.mean(shift**2)) < size.high
+    )  # twelve draws can be far from the 0.8 that they are of
 
 
 def test_counts_and_turned_tones_are_diagnosed_too():

@@ -2,15 +2,14 @@
 
 import jax.numpy as jnp
 import numpy as np
+import numpyro
 import numpyro.distributions as dist
 import pytest
 
-from dtprob.effects import Effect, Parameter, catalogue
+from dtprob.effects import Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap.model.nulls import check_nulls
 from dtprob.gap.model.problem import Problem
-from dtprob.models.declaration import declare
-from dtprob.models.label_twin import label_twin
 from tests.unit.gap.examples import bend, bump, draw, gusty, line
 
 
@@ -109,19 +108,23 @@ def test_an_effect_that_acts_on_none_of_the_data_passes():
     check_nulls(Problem(line, draw("line"), [nothing]))
 
 
-@pytest.mark.parametrize("by_name", ["regional_bias[everywhere]", None], ids=["library", "own"])
-def test_effects_on_whole_numbers_are_refused(by_name):
+def whole(x, y=None):
+    """What is expected are the whole numbers of the data."""
+    noise = numpyro.sample("noise", dist.HalfNormal(1.0))
+    with numpyro.plate("row", len(x)):
+        mean = numpyro.deterministic("mean", x)
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+
+def test_effects_on_whole_numbers_are_refused():
     """They have no gradient: a gap of three at every row was not seen at all."""
     rng = np.random.default_rng(0)
-    prediction = rng.integers(0, 20, 60)
-    data = {"x": rng.uniform(size=(60, 1)), "prediction": prediction, "y": prediction + rng.normal(size=60)}
-    lifted = Effect(
-        "lifted", {"predicted_label": lambda v, p, c: v + p["by"]}, (Parameter("by", dist.Normal()),)
-    )
-    effects = catalogue(declare(label_twin, data).sites, data, [by_name or lifted])
-    with pytest.raises(InputError, match=r"expected real numbers at site 'predicted_label', got whole"):
-        check_nulls(Problem(label_twin, data, effects))
-    check_nulls(Problem(label_twin, {**data, "prediction": prediction.astype(float)}, effects))
+    x = rng.integers(0, 20, 60)
+    data = {"x": jnp.asarray(x), "y": jnp.asarray(x + rng.normal(size=60))}
+    lifted = Effect("lifted", {"mean": lambda v, p, c: v + p["by"]}, (Parameter("by", dist.Normal()),))
+    with pytest.raises(InputError, match=r"expected real numbers at site 'mean', got whole"):
+        check_nulls(Problem(whole, data, [lifted]))
+    check_nulls(Problem(whole, {**data, "x": jnp.asarray(x, float)}, [lifted]))
 
 
 def test_two_effects_of_one_name_are_refused():
