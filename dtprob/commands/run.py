@@ -58,7 +58,7 @@ def chosen(case: Case, engine: str | None, seed: int | None) -> Case:
         case = replace(case, engine=case.engine if same else EngineSection(name=engine))
     if seed is not None:
         if not 0 <= seed <= LARGEST:
-            raise InputError("--seed", "a whole number from 0 to 2^63 - 1", str(seed), "Give another seed")
+            raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
         case = replace(case, seed=replace(case.seed, value=seed))
     return case
 
