@@ -218,6 +218,13 @@ def load_case(path: str | os.PathLike[str]) -> Case:
     return parse_case(read_document(path), path)
 
 
+def check_seed(seed: int) -> int:
+    """A seed that is given instead of the one of a CASE; raises InputError where it cannot be one."""
+    if not _is_whole(seed):
+        raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
+    return seed
+
+
 def read_document(path: Path) -> dict[str, Any]:
     """The sections of a TOML file.
 

@@ -21,11 +21,8 @@ def keep_compiled() -> None:
     try:
         folder = cache_folder()
         prune(folder, LARGEST)
-    except (
-        OSError,
-        RuntimeError,
-    ):  # no home, or a folder of another user: compiling again takes time, and no more
-        return
+    except (OSError, RuntimeError):
+        return  # no home, or a folder of another user: compiling again takes time, and no more
     jax.config.update("jax_compilation_cache_dir", str(folder))
     # even small programs: reading one back takes a tenth of compiling it
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)

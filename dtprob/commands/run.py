@@ -9,11 +9,10 @@ from typing import Any, Literal
 
 import jax
 
-from dtprob.case import LARGEST, Case, EngineSection
+from dtprob.case import Case, EngineSection, check_seed
 from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
-from dtprob.errors import InputError
 from dtprob.files import make_folder, sha256, write_text
 from dtprob.inference import LATENTS_ONLY, Posterior, RunOptions
 from dtprob.workflow import Prepared, prepare
@@ -57,9 +56,7 @@ def chosen(case: Case, engine: str | None, seed: int | None) -> Case:
         same = engine == case.engine.name
         case = replace(case, engine=case.engine if same else EngineSection(name=engine))
     if seed is not None:
-        if not 0 <= seed <= LARGEST:
-            raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
-        case = replace(case, seed=replace(case.seed, value=seed))
+        case = replace(case, seed=replace(case.seed, value=check_seed(seed)))
     return case
 
 

@@ -8,10 +8,10 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
+from dtprob.case import check_seed
 from dtprob.commands.run import session
 from dtprob.control import TablePolicy, export
 from dtprob.data import NetworkLog, write
-from dtprob.errors import InputError
 from dtprob.files import make_folder, write_text
 from dtprob.workflow.loop import (
     State,
@@ -51,9 +51,7 @@ def run(twin_case: Path, out: Path, *, seed: int | None, no_code: bool, resume: 
     """
     case = load_twin_case(twin_case)
     if seed is not None:
-        if seed < 0:
-            raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
-        case = replace(case, seed=replace(case.seed, value=seed))
+        case = replace(case, seed=replace(case.seed, value=check_seed(seed)))
     make_folder(out)
     with session() as say, jax.enable_x64(False):
         if case.user_code and not no_code:

@@ -8,11 +8,13 @@ import warnings
 from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, as_completed
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
 
 from pebble import ProcessExpired, ProcessPool
 
+from dtprob.case import check_seed
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
@@ -99,8 +101,8 @@ def run(
         raise InputError(
             f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
         )
-    if seed is not None and seed < 0:
-        raise InputError("--seed", "a whole number from 0", str(seed), "Give another seed")
+    if seed is not None:
+        check_seed(seed)
     make_folder(out)
     wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
     jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in found]
@@ -174,7 +176,7 @@ class _Job:
         identity = self.folder / _IDENTITY
         return identity.is_file() and identity.read_text(encoding="utf-8") == self.identity
 
-    @property
+    @cached_property
     def identity(self) -> str:
         """What the answers depend on, as text."""
         return f"dtprob {edition()}\nseed {self.seed}\ncase {sha256(self.case)}\n"

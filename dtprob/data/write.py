@@ -35,10 +35,8 @@ def write(path: str | os.PathLike[str], data: Data) -> None:
     suffix = path.suffix.lower()
     arrays = file_arrays(data)
     if suffix == ".npz":
-        with (
-            atomic_write(path) as temporary,
-            temporary.open("wb") as stream,
-        ):  # a name in capitals would be changed
+        # into a stream: the suffix of a name in capitals would be changed
+        with atomic_write(path) as temporary, temporary.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **arrays)
     elif suffix == ".nc" and isinstance(data, ChannelData | PowerData):
         _write_netcdf(path, arrays, CHANNEL_ARRAYS if isinstance(data, ChannelData) else POWER_ARRAYS)

@@ -15,7 +15,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from numpyro.distributions import constraints
 from scipy import stats
 
 from dtprob.errors import InputError
@@ -67,8 +66,7 @@ class Parameter:
             expected = "is_place=True and a normal prior of one number where values are tried"
             got = f"is_place={self.is_place}, {type(self.prior).__name__} of shape {self.shape}"
             raise InputError(f"parameter {self.name}", expected, got, "Leave tried out, or make it a place.")
-        upper = getattr(self._support, "upper_bound", None)
-        if not self.is_place and upper is not None and np.any(np.asarray(upper) == self.null):
+        if not self.is_place and np.any(self.limits[1] == self.null):
             expected = f"a prior that reaches above the null {self.null:g}"
             remedy = f"Write the effect with the other sign, so that {self.name} is at its null or above."
             raise InputError(f"parameter {self.name}", expected, "one that ends there", remedy)
@@ -106,19 +104,16 @@ class Parameter:
     @property
     def is_one_sided(self) -> bool:
         """Whether the null lies at the lower edge of what the prior allows, as for an attenuation."""
-        support = self._support
-        if support in (constraints.positive, constraints.nonnegative):
-            return self.null == 0.0
-        lower = getattr(support, "lower_bound", None)
-        return lower is not None and bool(np.all(np.asarray(lower) == self.null))
+        return bool(np.all(self.limits[0] == self.null))
 
     @property
-    def _support(self) -> Any:
-        """What values an entry may take."""
+    def limits(self) -> tuple[np.ndarray, np.ndarray]:
+        """The lowest and the highest value that the prior allows an entry; infinite where there is no limit."""
         support: Any = self.prior.support
         while hasattr(support, "base_constraint"):
             support = support.base_constraint
-        return support
+        low, high = (getattr(support, f"{end}_bound", None) for end in ("lower", "upper"))
+        return np.asarray(-np.inf if low is None else low), np.asarray(np.inf if high is None else high)
 
 
 def _stray(base: Any) -> Any:

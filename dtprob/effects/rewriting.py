@@ -58,9 +58,8 @@ class Rewriting(Changing):
         super().process_message(msg)
         if msg["type"] != "sample":
             return
-        if (
-            msg["name"] in self._drawn
-        ):  # a field counts once, whatever masks and scales the model has around the site
+        if msg["name"] in self._drawn:
+            # a field counts once, whatever masks and scales the model has around the site
             msg["fn"], msg["scale"] = self._drawn[msg["name"]], None
         context = Context(self._data, self._seen)
         for effect in self._effects:

@@ -51,8 +51,9 @@ def _case(plan: Plan, out: Path, order: Order, site: Site) -> dict[str, Any]:
     """Measure and write one case; beside its record lies the noiseless channel with and without the effects."""
     choice = choose(order.rng, order.kind, site, order.lambda_, order.families)
     bench = site.bench
-    there = [*(one.impairment.name for one in choice.effects), *([choice.alias[0]] if choice.alias else [])]
-    left_out = order.left_out(choice.excluded, there, order.families, TAKEN_OUT)
+    effects = [one.record() for one in choice.effects]
+    alias = {"name": choice.alias[0], "correlation": choice.alias[1]} if choice.alias else None
+    left_out = order.left_out(choice.excluded, [*effects, alias], order.families, TAKEN_OUT)
     simulation = bench.simulate(*((one.impairment, one.size) for one in choice.effects))
     channel = measure(order.rng, simulation, bench.sounding)
     write_case(
@@ -71,9 +72,9 @@ def _case(plan: Plan, out: Path, order: Order, site: Site) -> dict[str, Any]:
     with atomic_write(out / truth) as temporary:
         np.savez(temporary, base=bench.base.mean, noiseless=simulation.mean)
     return order.record(
-        [one.record() for one in choice.effects],
+        effects,
         left_out,
-        alias={"name": choice.alias[0], "correlation": choice.alias[1]} if choice.alias else None,
+        alias,
         cells=_cells(bench, simulation, sum(one.lambda_ for one in choice.effects)),
         gap_db=_gap_db(simulation, bench.base),
         noise_power=simulation.noise.mean_power(channel.shape),

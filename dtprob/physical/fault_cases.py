@@ -190,11 +190,11 @@ def make_case(out: Path, order: Order, setup: Setup) -> dict[str, Any]:
     for one in choice.faults:
         law = one.fault.change(law, one.size)
     measured = measure(np.random.default_rng([order.seed, order.index, 2]), law)
-    there = [*(one.fault.name for one in choice.faults), *([choice.alias["name"]] if choice.alias else [])]
-    left_out = order.left_out(choice.excluded, there, setup.families.known, _TAKEN_OUT)
+    effects = [one.record() for one in choice.faults]
+    left_out = order.left_out(choice.excluded, [*effects, choice.alias], setup.families.known, _TAKEN_OUT)
     setup.write(out / "cases" / order.name, measured, left_out, order.index)
     return order.record(
-        [one.record() for one in choice.faults],
+        effects,
         left_out,
         choice.alias,
         cells=setup.cells(law, sum(one.lambda_ for one in choice.faults)),

@@ -55,7 +55,11 @@ class Order:
         return f"{self.index:04d}"
 
     def left_out(
-        self, excluded: Sequence[str], there: Iterable[str], known: Sequence[str], share: float
+        self,
+        excluded: Sequence[str],
+        there: Iterable[Mapping[str, Any] | None],
+        known: Sequence[str],
+        share: float,
     ) -> tuple[str, ...]:
         """Families that the case takes out of the library: those of an unlisted cause, or as often an innocent one.
 
@@ -63,14 +67,14 @@ class Order:
 
         Args:
             excluded: families of the cause.
-            there: names of effects of the case, and of what looks like them; their families stay.
+            there: records of the case's effects, and of what looks like them, if anything does; their families stay.
             known: families that the library has.
             share: of the unlisted cases whose family is taken out.
         """
         if excluded or self.kind == "unlisted":
             return tuple(excluded)
         rng = np.random.default_rng([self.seed, self.index, 9])
-        families = {name.split("[")[0] for name in there}
+        families = {str(one["name"]).split("[")[0] for one in there if one}
         innocent = [family for family in known if family not in families]
         return (str(rng.choice(innocent)),) if innocent and rng.random() < share else ()
 

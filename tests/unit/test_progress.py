@@ -15,9 +15,9 @@ class Terminal(io.StringIO):
 def test_names_in_brackets_are_told_on_a_terminal(monkeypatch):
     monkeypatch.setattr(sys, "stdout", Terminal())
     with telling() as say:
-        say("LISTED: device_disconnected[device_1], see case.toml [engine] and [/tmp/out]")
+        say("LISTED: device_disconnected[device_1], see case.toml [engine] and [/results]")
     told = " ".join(sys.stdout.getvalue().split())
-    assert "device_disconnected[device_1], see case.toml [engine] and [/tmp/out]" in told
+    assert "device_disconnected[device_1], see case.toml [engine] and [/results]" in told
 
 
 def test_the_work_goes_on_where_nobody_reads(monkeypatch):

@@ -30,12 +30,6 @@ class Bounded(NamedTuple):
     low: Float[np.ndarray, " n"]
     high: Float[np.ndarray, " n"]
 
-    @property
-    def bounded(self) -> Bounded:
-        """The bounded coordinates alone."""
-        at = np.isfinite(self.low) | np.isfinite(self.high)
-        return Bounded(self.mean[at], self.covariance[np.ix_(at, at)], self.low[at], self.high[at])
-
 
 def log_positive(
     mean: Float[np.ndarray, "case n"], covariance: Float[np.ndarray, "case n n"]
@@ -120,11 +114,12 @@ def bounded_draws(vector: Bounded, count: int, rng: np.random.Generator) -> Floa
         count: of draws.
         rng: source of randomness.
     """
-    mean, covariance, inner = vector.mean, vector.covariance, vector.bounded
+    mean, covariance, low, high = vector
     noise = rng.standard_normal((count, len(mean)))
-    if not len(inner.mean):
+    at = np.isfinite(low) | np.isfinite(high)
+    if not at.any():
         return mean + noise @ np.linalg.cholesky(covariance).T
-    at = np.isfinite(vector.low) | np.isfinite(vector.high)
+    inner = Bounded(mean[at], covariance[np.ix_(at, at)], low[at], high[at])
     free, found = ~at, np.empty((count, len(mean)))
     found[:, at] = _gibbs(inner, count, rng)
     if free.any():

@@ -7,17 +7,15 @@ log-uniformly, so that the price of an effect depends on how well the data deter
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
-from numpyro.distributions import constraints
 from scipy import special
 
-from dtprob.effects.effect import Effect, Parameter
+from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.bounded import log_positive
-from dtprob.models.declaration import base_constraint
 
 SCALES: Final = np.geomspace(1e-4, 1.0, 25)
 """Prior scales, as shares of the largest plausible one."""
@@ -116,18 +114,8 @@ def sides(effect: Effect) -> Bool[np.ndarray, " n"]:
 
 def limits(effect: Effect) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, " n"]]:
     """The lowest and the highest value that its prior allows each of an effect's parameters, flat."""
-    ends = [_ends(p) for p in effect.parameters]
+    ends = [p.limits for p in effect.parameters]
     return _flat(effect, [low for low, _ in ends]), _flat(effect, [high for _, high in ends])
-
-
-def _ends(parameter: Parameter) -> tuple[ArrayLike, ArrayLike]:
-    support: Any = base_constraint(parameter.prior.support)
-    if support in (constraints.positive, constraints.nonnegative):
-        return 0.0, np.inf
-    return (
-        np.asarray(getattr(support, "lower_bound", -np.inf)),
-        np.asarray(getattr(support, "upper_bound", np.inf)),
-    )
 
 
 def places(effect: Effect) -> Bool[np.ndarray, " n"]:

@@ -91,6 +91,14 @@ class Answer:
         """Whether there is no answer."""
         return self.report is None
 
+    def alarms(self) -> list[bool]:
+        """Whether a gap is claimed; nothing where there is no answer, which is no silence either."""
+        return [] if self.is_failed else [self.is_alarm]
+
+    def calls_unlisted(self) -> list[bool]:
+        """Whether the cause is said to be unlisted; nothing where there is no answer."""
+        return [] if self.is_failed else [self.is_unlisted]
+
     @property
     def is_missed(self) -> bool:
         """Whether no gap is claimed."""

@@ -30,8 +30,8 @@ _EXACT: Final[Mapping[str, Test]] = {
 }
 _MEASURES: Final[Mapping[str, Mapping[str, Test]]] = {
     "null": {
-        "alarm": lambda answer: [] if answer.is_failed else [answer.is_alarm],
-        "says unlisted": lambda answer: [] if answer.is_failed else [answer.is_unlisted],
+        "alarm": Answer.alarms,
+        "says unlisted": Answer.calls_unlisted,
     },
     "listed": {
         **_EXACT,

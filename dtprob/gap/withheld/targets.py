@@ -39,14 +39,6 @@ NOT_IMITATED: Final = 64.0
 """Lambda that no single candidate explains, from which on a cause that the library lacks is to be called so."""
 
 
-def _alarm(answer: Answer) -> list[bool]:
-    return [] if answer.is_failed else [answer.is_alarm]
-
-
-def _falsely_unlisted(answer: Answer) -> list[bool]:
-    return [] if answer.is_failed else [answer.is_unlisted]
-
-
 def _resolved(answer: Answer) -> list[bool]:
     return [answer.is_right] if answer.is_resolvable else []
 
@@ -68,8 +60,8 @@ def _seconds(answer: Answer) -> Sequence[float]:
 
 
 TARGETS: Final = (
-    Target("alarm without a gap", ("null",), 0.0, _alarm, 0.0, 0.01),
-    Target("alarm without a gap, upper limit", ("null",), 0.0, _alarm, 0.0, 0.015, most),
+    Target("alarm without a gap", ("null",), 0.0, Answer.alarms, 0.0, 0.01),
+    Target("alarm without a gap, upper limit", ("null",), 0.0, Answer.alarms, 0.0, 0.015, most),
     Target("right effect first", SINGLE, 100.0, lambda a: [a.is_right], 0.975, 1.0),
     Target("truth in the class", (*SINGLE, *SETS), 50.0, lambda a: [a.is_in_class], 0.99, 1.0),
     Target("exact set of two", ("pair",), 80.0, lambda a: [a.is_right], 0.98, 1.0),
@@ -79,7 +71,7 @@ TARGETS: Final = (
     Target("exact set of three, resolvable", ("triple",), 80.0, _resolved, 0.96, 1.0),
     Target("unlisted called so", ("unlisted",), 64.0, lambda a: [a.is_unlisted], 0.97, 1.0),
     Target("unlisted called so, not imitated", ("unlisted",), 64.0, _called, 0.97, 1.0),
-    Target("called unlisted and is not", ("null", *SINGLE, *SETS), 0.0, _falsely_unlisted, 0.0, 0.01),
+    Target("called unlisted and is not", ("null", *SINGLE, *SETS), 0.0, Answer.calls_unlisted, 0.0, 0.01),
     Target("right site of what is unlisted", ("unlisted",), 64.0, Answer.right_site, 0.90, 1.0),
     Target("right site of what is listed", (*SINGLE, *SETS), 100.0, Answer.right_site, 0.95, 1.0),
     Target("size in its 90% interval", SINGLE, 0.0, Answer.covered_size, 0.88, 0.93),

@@ -85,11 +85,10 @@ def _case(out: Path, order: Order, network: Network) -> dict[str, Any]:
     write(folder / "before.csv", record((*draws, 2), network, BEFORE))
     after = record((*draws, 3), network, AFTER, [(one.fault, one.size) for one in faults])
     write(folder / "after.csv", after)
-    there = [*(one.fault.name for one in faults), *([alias["name"]] if alias else [])]
-    left_out = order.left_out(excluded, there, order.families, _TAKEN_OUT)
+    effects = [one.record() for one in faults]
+    left_out = order.left_out(excluded, [*effects, alias], order.families, _TAKEN_OUT)
     write_text(folder / "case.toml", _MODEL + case_end(left_out, order.index))
     about = {"arrival": network.arrival.tolist(), "reception": network.reception.tolist()}
-    effects = [one.record() for one in faults]
     return order.record(effects, left_out, alias, cells=_cells(network, faults), **about)
 
 

@@ -145,9 +145,8 @@ class PlayedNetwork:
         try:
             table = np.stack([np.asarray(seen[agent]).reshape(-1)[:3] for agent in self._agents])
             valid = table.shape[1] == 3 and np.all((table >= 0) & (table <= [self._capacity, 1, 1]))
-            valid = valid and np.all(
-                table == np.round(table)
-            )  # a share of the capacity is no number of packets
+            # a share of the capacity is no number of packets
+            valid = valid and np.all(table == np.round(table))
         except (KeyError, ValueError, TypeError) as error:
             table, valid = repr(error), False
         if not valid or isinstance(table, str):

@@ -63,12 +63,12 @@ def test_a_case_does_not_tell_its_kind_by_what_it_leaves_out():
     found = []
     for index in range(2000):
         order = Order(index, 0, "listed", 1.0, ("a", "b", "c"), np.random.default_rng(0))
-        found.append(order.left_out((), ["a[1]"], order.families, 2 / 3))
+        found.append(order.left_out((), [{"name": "a[1]"}, None], order.families, 2 / 3))
     assert {family for one in found for family in one} == {"b", "c"}
     assert stats.binomtest(sum(map(len, found)), 2000, 2 / 3).pvalue > 1e-3
     unlisted = Order(0, 0, "unlisted", 1.0, ("a", "b"), np.random.default_rng(0))
-    assert unlisted.left_out(("a",), ["a"], ("a", "b"), 1.0) == ("a",)
-    assert unlisted.left_out((), ["foreign"], ("a", "b"), 1.0) == ()
+    assert unlisted.left_out(("a",), [{"name": "a"}], ("a", "b"), 1.0) == ("a",)
+    assert unlisted.left_out((), [{"name": "foreign"}], ("a", "b"), 1.0) == ()
 
 
 @pytest.mark.parametrize("lambda_", [0.0, float("nan"), float("inf")])
