@@ -78,8 +78,9 @@ def prepared(data, model=table, cluster="street"):
     return problem, fitted, parts, closed.judged(problem, parts)
 
 
-def modelled(data, labels, model=table, **options):
+def modelled(data, labels, model=table, *, charged=0.0, **options):
     problem, fitted, parts, held = prepared(data, model)
+    parts = [part._replace(charged=np.full(problem.n_cluster, charged)) for part in parts]
     suspects = [suspect(problem, label, **options) for label in labels]
     best = float(held.log_likelihood.sum()) + 1e-9
     view = SimpleNamespace(problem=problem, fitted=fitted, location=SimpleNamespace(suspects=tuple(suspects)))
@@ -200,6 +201,12 @@ def test_what_all_clusters_share_carries_over():
     assert found.before.coverage < 0.85
     assert 0.85 < found.after.coverage < 0.95
     assert found.after.error_ratio == pytest.approx(1.0, abs=0.12)
+
+
+def test_a_cause_is_charged_for_its_choice_beside_a_model_of_the_rest_too():
+    """Else what the choice among its family costs would be credited to the model of the rest."""
+    free, charged = (modelled(rows(2, wave), ["along place"], charged=nats)[1] for nats in (0.0, 0.5))
+    np.testing.assert_allclose(charged.held.log_likelihood, free.held.log_likelihood - 0.5, atol=1e-9)
 
 
 @pytest.mark.parametrize(
