@@ -44,8 +44,8 @@ class _Real(Changing):
 def real_sites(model: Model, data: Data) -> Model:
     """The model with its deterministic sites of whole numbers made real, as far as that changes nothing; or itself.
 
-    A site stays as it is where the model does not run with real numbers there, as where it is an index, where what it observes
-    would be others or of another law, and where a law has no finite derivative in them, as (-1) ** n in n.
+    A site stays as it is where the model does not run with real numbers there, as where it is an index, where what is
+    observed would be others or of another law, and where a law has no finite derivative in them, as (-1) ** n in n.
 
     Args:
         model: any model.
