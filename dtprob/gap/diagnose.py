@@ -15,7 +15,7 @@ from dtprob.gap.compose import compose
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.integrated import based
-from dtprob.gap.fitting.soundness import check_noise, idle, lopsided, notes
+from dtprob.gap.fitting.soundness import check_noise, check_possible, idle, lopsided, notes
 from dtprob.gap.fitting.states import held
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
@@ -77,8 +77,8 @@ def diagnose(
     Raises:
         InputError: effects on absent sites, effects that change the model at their null, fewer than four
             clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end,
-            observed values that their distribution cannot take, a base model that does not fit, or one that meets the data
-            exactly.
+            observed values that their distribution cannot take or that are impossible under the base model, a base model
+            that does not fit, or one that meets the data exactly.
     """
     engine = resolve(engine) if isinstance(engine, str) else engine
     check_indices(model, data)
@@ -117,6 +117,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     with differentiated_forwards():
         start = based(problem, keys[0], polished=settings.polished, say=say)
     problem, base = start.problem, start.fitted
+    check_possible(problem, base)
     check_noise(problem, base)
     check_tolerance(problem, problem.compiled.misses(base.x), settings.tolerance_db)
     of_fit = notes(problem, base)

@@ -41,7 +41,6 @@ def label_twin(
         The predicted labels.
     """
     del x
-    prediction = jnp.asarray(prediction, float)  # maps of whole decibels are numbers like others
     deviation: Any = numpyro.sample("error_deviation", _size_of_errors(prediction))
     predicted: Any = numpyro.deterministic("predicted_label", prediction)
     spread: Any = numpyro.deterministic("label_deviation", jnp.broadcast_to(deviation, prediction.shape))
@@ -52,7 +51,8 @@ def label_twin(
 
 def _size_of_errors(prediction: Float[Array, " sample"]) -> dist.Distribution:
     """Its prior: about a third of how much predictions vary; where they do not, anything about their own size."""
-    spread, size = jnp.std(prediction), jnp.sqrt(jnp.mean(prediction**2))
+    spread = jnp.std(prediction)
+    size = jnp.hypot(jnp.mean(prediction), spread)
     size = jnp.where(size > 0, size, 1.0)
     varies = spread > _FLAT * size
     unit = jnp.where(varies, spread, _SHARE * size)

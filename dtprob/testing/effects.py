@@ -13,7 +13,8 @@ from numpyro import handlers
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.rewriting import Rewriting, may_become
-from dtprob.models.arguments import Model
+from dtprob.gap.model.whole_numbers import real_sites
+from dtprob.models.arguments import Model, as_arrays
 from dtprob.testing.contract import expect, same
 
 type Trace = Mapping[str, Mapping[str, Any]]
@@ -46,6 +47,7 @@ def check_effect(
     for parameter in effect.parameters:
         _check_parameter(f"{what}, parameter {parameter.name!r}", parameter, key)
     with numpyro.validation_enabled(False):  # values that are not finite are for the checks to find
+        model = real_sites(model, as_arrays(data))  # as a diagnosis takes it
         plain = _run(model, data, key)
         for site in effect.sites:
             remedy = "Give it to models that have it"

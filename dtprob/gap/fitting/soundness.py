@@ -15,6 +15,7 @@ from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.fitting.states import are_states
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.observation import whiten
 
 UNSEEN: Final = "nothing observed depends on it"
 """What hides an effect that does nothing."""
@@ -62,12 +63,48 @@ def broken(problem: Problem, starts: Sequence[np.ndarray]) -> InputError:
                 _counted(bad),
                 "Check the units of the data and the priors of what enters this site",
             )
-    return InputError(
+    return _impossible(problem, starts) or InputError(
         what,
         "a finite likelihood somewhere under its prior",
         f"none from any of {len(starts)} starts, though all its sites are finite",
         f"Check that {', '.join(problem.declaration.observed)} can take the values of the data, in the same units",
     )
+
+
+def check_possible(problem: Problem, fitted: Fit) -> None:
+    """Refuse data that cannot be under the fitted base model, as a count where it expects none.
+
+    Raises:
+        InputError: an observed value is impossible; the first is named.
+    """
+    error = _impossible(problem, [fitted.x])
+    if error is not None:
+        raise error
+
+
+def _impossible(problem: Problem, points: Sequence[np.ndarray]) -> InputError | None:
+    """What is wrong with the first observed values that can be at none of the points; nothing where all can be."""
+    at = [problem.compiled.observations(x) for x in points]
+    for name, values in problem.observed.values.items():
+        seen = np.asarray(values)
+        bad = np.all([np.asarray(whiten.impossible(one[name], values)) for one in at], axis=0)
+        if bad.any():
+            first = tuple(int(k) for k in np.argwhere(bad)[0])
+            more = f" and {bad.sum() - 1} more" if bad.sum() > 1 else ""
+            argument = problem.declaration.observed[name].argument or name
+            given = {
+                n: np.broadcast_to(np.asarray(v), bad.shape)[first]
+                for n, v in at[0][name].parameters.items()
+                if n != "mask" and np.ndim(v) == bad.ndim
+            }
+            law = ", ".join(f"{n} {v:.3g}" for n, v in given.items())
+            return InputError(
+                f"data {argument}",
+                f"values that can be under the base model {problem.declaration.name}",
+                f"{seen[first]} at [{', '.join(map(str, first))}] where it has {at[0][name].family} of {law}{more}",
+                "Leave such rows out, or let the model allow for them by a small rate or chance",
+            )
+    return None
 
 
 def check_noise(problem: Problem, fitted: Fit) -> None:

@@ -26,7 +26,7 @@ def check_nulls(problem: Problem) -> None:
 
     Raises:
         InputError: one changes a site there, or makes it infinite or not a number, or has no slope there; or
-            a site is of whole numbers.
+            a site is of whole numbers that cannot be real ones.
     """
     for effect in problem.effects:
         if effect.kind == "variance" and effect.distributions:
@@ -72,12 +72,12 @@ def _is_of_library(effect: Effect) -> bool:
 
 
 def _check_real(problem: Problem, effect: Effect) -> None:
-    """What is of whole numbers has no gradient, and so no effect on it has a score."""
+    """What is of whole numbers, as an index, has no gradient, and so no effect on it has a score."""
     for site in effect.rewrites:
         declared = problem.declaration.sites[site]
         if declared.kind == "deterministic" and declared.size and site not in problem.float_sites:
-            got = "whole numbers, or true and false"
-            remedy = "Make it real in the model or in the data, as by x.astype(float)"
+            got = "true and false, or whole numbers that the model takes only as such"
+            remedy = "Let the effect rewrite a site that the model computes from it"
             raise InputError(f"effect {effect.name}", f"real numbers at site {site!r}", got, remedy)
 
 

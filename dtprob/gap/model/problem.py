@@ -34,6 +34,7 @@ from dtprob.gap.model.rows import Rows, make_rows
 from dtprob.gap.model.running import Arrays, Runner
 from dtprob.gap.model.shapes import latent_shapes, observed_shapes, perturbed_sites, shapes_of_fields
 from dtprob.gap.model.volume import Volume
+from dtprob.gap.model.whole_numbers import real_sites
 from dtprob.gap.observation import whiten
 from dtprob.inference.posterior import Sampler
 from dtprob.models.arguments import Data, Model, as_arrays, split_static
@@ -78,7 +79,7 @@ class Problem:
         self._cluster = None if self.column else cluster
         self._declare(model, static)
         check_supported(model, data)
-        model = unrolled(model, data)
+        model = unrolled(real_sites(model, data), data)
         if model is not self.model:
             self._declare(model, static)
         self._check_effects()

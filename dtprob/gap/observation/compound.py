@@ -7,6 +7,7 @@ over counts are closed, those over mixed values quadratures.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any, Final
 
 import jax
@@ -25,10 +26,18 @@ _NODES: Final = 96
 def zero_inflated(base: Likelihood, _: str) -> Likelihood:
     """Counts, some of which are zero whatever the base says; "gate" is the chance of that."""
 
+    def log_chance(own: Parameters, value: jax.Array) -> jax.Array:
+        return base.make(**own).log_prob(value) if base.density is None else base.density(own, value)
+
+    def density(p: Parameters, value: jax.Array) -> jax.Array:
+        is_zero = value <= 0
+        some = jnp.log1p(-jnp.where(is_zero, 0.0, p["gate"])) + log_chance(own_of(base, p), value)
+        return jnp.where(is_zero, jnp.log(jnp.where(is_zero, at_zero(p)[1], 1.0)), some)
+
     def at_zero(p: Parameters) -> tuple[jax.Array, jax.Array, jax.Array]:
         """Chance that the base is zero, that anything is, and the base's rows there."""
         own, nothing = own_of(base, p), jnp.zeros(jnp.shape(p["gate"]))
-        chance = jnp.exp(base.make(**own).log_prob(nothing))
+        chance = jnp.exp(log_chance(own, nothing))
         return chance, p["gate"] + (1 - p["gate"]) * chance, base.residual(own, nothing)
 
     def scores(p: Parameters, value: jax.Array) -> jax.Array:
@@ -56,7 +65,7 @@ def zero_inflated(base: Likelihood, _: str) -> Likelihood:
         {"gate": 0},
         lambda p: (1 - p["gate"]) * base.make(**own_of(base, p)).mean,
     )
-    return whitened(made, Scores(scores, information, change), base.relocate)
+    return replace(whitened(made, Scores(scores, information, change), base.relocate), density=density)
 
 
 def _bordered(within: jax.Array, across: jax.Array, last: jax.Array) -> jax.Array:

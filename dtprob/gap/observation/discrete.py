@@ -1,5 +1,7 @@
 """Scores of counts, outcomes and classes as whitened regression rows; the counterpart of `residuals` for what is discrete.
 
+Where a parameter is at its end (a rate or a chance of 0, a chance of 1) the outcome is certain, and a row tells nothing.
+
 A residual takes parameters and values, a shift parameters and a change of each; both give (component, *shape of the value).
 """
 
@@ -10,7 +12,7 @@ from typing import Final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.scipy.special import betainc, digamma
+from jax.scipy.special import betainc, digamma, gammaln
 
 from dtprob.gap.observation.residuals import Parameters
 
@@ -21,14 +23,31 @@ _STEP: Final = 1e-3
 """Relative step of differences, since the incomplete beta function has no derivative in its parameters."""
 
 
+def _over(value: jax.Array, size: jax.Array) -> jax.Array:
+    """A value in units of a size, 0 where the size is 0."""
+    return jnp.where(size > 0, value / jnp.where(size > 0, size, 1.0), 0.0)
+
+
+def _root(square: jax.Array) -> jax.Array:
+    """A root that is 0 at 0, with its slope."""
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
 def poisson_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of a Poisson distribution."""
-    return ((value - p["rate"]) / jnp.sqrt(p["rate"]))[None]
+    return _over(value - p["rate"], _root(p["rate"]))[None]
 
 
 def poisson_shift(p: Parameters, t: Parameters) -> jax.Array:
     """Shift of the rows of a Poisson distribution."""
-    return (t["rate"] / jnp.sqrt(p["rate"]))[None]
+    return _over(t["rate"], _root(p["rate"]))[None]
+
+
+def poisson_density(p: Parameters, value: jax.Array) -> jax.Array:
+    """Log density of a Poisson distribution; its slope is -1 at a rate of 0 that nothing was counted at."""
+    some = value > 0
+    counted = value * jnp.log(jnp.where(some, p["rate"], 1.0))
+    return jnp.where(some, counted, 0.0) - p["rate"] - gammaln(value + 1.0)
 
 
 def counts_deviation(p: Parameters) -> jax.Array:
@@ -95,17 +114,23 @@ def counts_shift(p: Parameters, t: Parameters) -> jax.Array:
 
 def geometric_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of a geometric distribution, of the failures before a success; they grow with the value."""
-    return ((value * p["probs"] - (1 - p["probs"])) / jnp.sqrt(1 - p["probs"]))[None]
+    return _over(value * p["probs"] - (1 - p["probs"]), _root(1 - p["probs"]))[None]
 
 
 def geometric_shift(p: Parameters, t: Parameters) -> jax.Array:
     """Shift of the rows of a geometric distribution."""
-    return (-t["probs"] / (p["probs"] * jnp.sqrt(1 - p["probs"])))[None]
+    return _over(-t["probs"] / p["probs"], _root(1 - p["probs"]))[None]
+
+
+def geometric_density(p: Parameters, value: jax.Array) -> jax.Array:
+    """Log density of a geometric distribution, that of no failures where success is certain."""
+    failures = value * jnp.log1p(-jnp.where(value > 0, p["probs"], 0.0))
+    return jnp.where(value > 0, failures, 0.0) + jnp.log(p["probs"])
 
 
 def geometric_relocate(p: Parameters, step: jax.Array) -> Parameters:
     """Another expected number of failures."""
-    odds = (1 - p["probs"]) / p["probs"] * jnp.exp(step / jnp.sqrt(1 - p["probs"]))
+    odds = (1 - p["probs"]) / p["probs"] * jnp.exp(_over(step, _root(1 - p["probs"])))
     return {**p, "probs": 1 / (1 + odds)}
 
 
@@ -128,19 +153,35 @@ def logits_deviation(p: Parameters) -> jax.Array:
 
 def bernoulli_shift(p: Parameters, t: Parameters) -> jax.Array:
     """Shift of the rows of a Bernoulli or binomial distribution of logits."""
-    return (t["logits"] * logits_deviation(p))[None]
+    deviation = logits_deviation(p)
+    return jnp.where(deviation > 0, t["logits"] * deviation, 0.0)[None]
 
 
 def probs_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of a Bernoulli or binomial distribution of probabilities."""
     n = p.get("total_count", jnp.ones(()))
-    return ((value - n * p["probs"]) / jnp.sqrt(jnp.maximum(n, 1.0) * p["probs"] * (1 - p["probs"])))[None]
+    return _over(value - n * p["probs"], _root(jnp.maximum(n, 1.0) * p["probs"] * (1 - p["probs"])))[None]
 
 
 def probs_shift(p: Parameters, t: Parameters) -> jax.Array:
     """Shift of the rows of a Bernoulli or binomial distribution of probabilities."""
     n = p.get("total_count", jnp.ones(()))
-    return (t["probs"] * jnp.sqrt(n / (p["probs"] * (1 - p["probs"]))))[None]
+    return (jnp.sqrt(n) * _over(t["probs"], _root(p["probs"] * (1 - p["probs"]))))[None]
+
+
+def probs_density(p: Parameters, value: jax.Array) -> jax.Array:
+    """Log density of a Bernoulli or binomial distribution; finite where a probability rounds to zero or one."""
+    n, probs = p.get("total_count", jnp.ones(())), p["probs"]
+    rounding = jnp.finfo(probs.dtype)
+    yes = value * jnp.log(jnp.maximum(jnp.where(value > 0, probs, 1.0), rounding.tiny))
+    no = (n - value) * jnp.log1p(-jnp.minimum(jnp.where(value < n, probs, 0.0), 1 - rounding.eps))
+    return yes + no + gammaln(n + 1.0) - gammaln(value + 1.0) - gammaln(n - value + 1.0)
+
+
+def probs_impossible(p: Parameters, value: jax.Array) -> jax.Array:
+    """Whether a certain outcome was another one, to which `probs_density` gives a density all the same."""
+    n = p.get("total_count", jnp.ones(()))
+    return ((p["probs"] <= 0) & (value > 0)) | ((p["probs"] >= 1) & (value < n))
 
 
 def _probability(p: Parameters) -> jax.Array:
@@ -160,4 +201,4 @@ def categorical_shift(p: Parameters, t: Parameters) -> jax.Array:
     if "logits" in t:
         mean = jnp.sum(probability * t["logits"], axis=-1, keepdims=True)
         return jnp.moveaxis(jnp.sqrt(probability) * (t["logits"] - mean), -1, 0)
-    return jnp.moveaxis(t["probs"] / jnp.sqrt(jnp.maximum(probability, 1e-30)), -1, 0)
+    return jnp.moveaxis(_over(t["probs"], _root(probability)), -1, 0)

@@ -34,6 +34,7 @@ class Likelihood:
         trailing: axes that a parameter has beyond those of the value.
         mean: expected value, where it is neither the location nor the distribution's own.
         log_prob: log density of each entry given those before it, where the entries of the last axis are one vector.
+        density: log density of each value, where NumPyro's has no gradient at an end of what parameters may be.
     """
 
     make: Callable[..., Any]
@@ -50,3 +51,4 @@ class Likelihood:
     trailing: Mapping[str, int] = field(default_factory=dict)
     mean: Callable[[Parameters], jax.Array] | None = None
     log_prob: Rows | None = None
+    density: Rows | None = None

@@ -159,9 +159,9 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.von_mises_residual,
         residuals.von_mises_shift,
         located=1,
-        relocate=moves.to_loc(lambda p: 1 / residuals.von_mises_spread(p)[1]),
+        relocate=moves.to_loc(lambda p: moves.held(p["concentration"] * residuals.von_mises_spread(p)[1])),
         respread=moves.grown(
-            "concentration", lambda p: 1 / (p["concentration"] * residuals.von_mises_spread(p)[2])
+            "concentration", lambda p: moves.held(p["concentration"] * residuals.von_mises_spread(p)[2])
         ),
     ),
     "GammaPoisson": Likelihood(
@@ -180,7 +180,8 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         ("rate",),
         discrete.poisson_residual,
         discrete.poisson_shift,
-        relocate=moves.grown("rate", lambda p: p["rate"] ** -0.5),
+        relocate=moves.grown("rate", lambda p: jnp.where(p["rate"] > 0, p["rate"], 1.0) ** -0.5),
+        density=discrete.poisson_density,
     ),
     "GeometricProbs": Likelihood(
         dist.Geometric,
@@ -188,6 +189,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.geometric_residual,
         discrete.geometric_shift,
         relocate=discrete.geometric_relocate,
+        density=discrete.geometric_density,
     ),
     "BetaBinomial": BETA_BINOMIAL,
     "BernoulliLogits": Likelihood(
@@ -199,7 +201,12 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         is_outcome=True,
     ),
     "BernoulliProbs": Likelihood(
-        dist.Bernoulli, ("probs",), discrete.probs_residual, discrete.probs_shift, is_outcome=True
+        dist.Bernoulli,
+        ("probs",),
+        discrete.probs_residual,
+        discrete.probs_shift,
+        is_outcome=True,
+        density=discrete.probs_density,
     ),
     "BinomialLogits": Likelihood(
         _binomial,
@@ -209,7 +216,11 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         relocate=moves.to_logits,
     ),
     "BinomialProbs": Likelihood(
-        _binomial, ("total_count", "probs"), discrete.probs_residual, discrete.probs_shift
+        _binomial,
+        ("total_count", "probs"),
+        discrete.probs_residual,
+        discrete.probs_shift,
+        density=discrete.probs_density,
     ),
     "CategoricalLogits": Likelihood(
         lambda logits: dist.Categorical(logits=logits), ("logits",), **_CLASSES, trailing={"logits": 1}

@@ -13,7 +13,12 @@ from dtprob.gap.observation.likelihood import Move
 from dtprob.gap.observation.residuals import Parameters
 
 _CERTAIN: Final = 0.05
-"""Standard deviation of an outcome below which it is nearly certain."""
+"""Root of an information below which a row tells nearly nothing, as the deviation of an outcome that is nearly certain."""
+
+
+def held(root: jax.Array) -> jax.Array:
+    """The step that goes with the root of an information, less far where there is nearly none."""
+    return 1 / jnp.maximum(root, _CERTAIN)
 
 
 def to_loc(deviation: Callable[[Parameters], jax.Array]) -> Move:
@@ -71,4 +76,4 @@ def beta_respread(p: Parameters, step: jax.Array) -> Parameters:
 
 def to_logits(p: Parameters, step: jax.Array) -> Parameters:
     """Logits that shift the row by the step; less far where the outcome is nearly certain."""
-    return {**p, "logits": p["logits"] + step / jnp.maximum(discrete.logits_deviation(p), _CERTAIN)}
+    return {**p, "logits": p["logits"] + step * held(discrete.logits_deviation(p))}

@@ -107,13 +107,14 @@ def _compound(fn: Any, value: Any, counted: jax.Array | None) -> _Found | None:
 
 
 def _mixed(fn: dist.MixtureSameFamily | dist.MixtureGeneral) -> _Found | None:
-    """Parts along a last axis, each with its chance."""
+    """Parts along a last axis, each with its chance; one that never comes tells nothing."""
     listed = isinstance(fn, dist.MixtureGeneral)
     parts = _stacked(fn.component_distributions) if listed else _of("Mixture", fn.component_distribution, {})
     if parts is None:
         return None
     chance = jnp.asarray(fn.mixing_distribution.probs)
-    given = {**parts.parameters, "log_weight": jnp.log(chance)}
+    least = jnp.finfo(chance.dtype).tiny
+    given = {**parts.parameters, "log_weight": jnp.log(jnp.maximum(chance, least))}
     shapes = {n: jnp.broadcast_shapes(jnp.shape(v), chance.shape[-1:]) for n, v in given.items()}
     return _Found(parts.family, {n: jnp.broadcast_to(v, shapes[n]) for n, v in given.items()})
 

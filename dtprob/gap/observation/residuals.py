@@ -24,6 +24,8 @@ type Parameters = dict[str, jax.Array]
 
 EULER: Final = 0.5772156649015329
 _ROOT_TWO: Final = 2.0**0.5
+_SMALL: Final = 0.01
+"""Concentration of an angle below which a series tells its mean cosine."""
 _NORMAL_FROM: Final = 3e3
 """Degrees of freedom from which on the data tell nothing of their number."""
 
@@ -209,29 +211,32 @@ def beta_shift(p: Parameters, t: Parameters) -> jax.Array:
 
 
 def von_mises_spread(p: Parameters) -> tuple[jax.Array, jax.Array, jax.Array]:
-    """Mean cosine A, and the roots of the information on the location, k A, and on the concentration k, 1 - A / k - A^2.
+    """Mean cosine A, and the roots of A / k and of the information on the concentration k, 1 - A / k - A^2.
 
-    The latter is a difference that rounding swallows where k is large: (1 + 1 / 2 k) / 2 k^2 there.
+    The information on the location is k A. At small k A is k / 2 - k^3 / 16 + k^5 / 96; the difference is one that rounding
+    swallows where k is large: (1 + 1 / 2 k) / 2 k^2 there.
     """
     k = p["concentration"]
+    near = jnp.where(k < _SMALL, k, 0.0)
     mean = i1e(k) / i0e(k)
+    ratio = jnp.where(k < _SMALL, 0.5 - near**2 / 16 + near**4 / 96, mean / jnp.where(k < _SMALL, 1.0, k))
     large = float(jnp.finfo(mean.dtype).eps) ** -0.25
     far = jnp.maximum(k, large)
-    spread = jnp.where(k < large, 1 - mean / k - mean**2, (1 + 0.5 / far) / (2 * far**2))
-    return mean, jnp.sqrt(k * mean), jnp.sqrt(spread)
+    spread = jnp.where(k < large, 1 - ratio - mean**2, (1 + 0.5 / far) / (2 * far**2))
+    return mean, jnp.sqrt(ratio), jnp.sqrt(spread)
 
 
 def von_mises_residual(p: Parameters, value: jax.Array) -> jax.Array:
     """Rows of a von Mises distribution (Mardia and Jupp, Directional Statistics, 2000, section 5.3)."""
-    mean, location, spread = von_mises_spread(p)
+    mean, ratio, spread = von_mises_spread(p)
     away = value - p["loc"]
-    return jnp.stack([p["concentration"] * jnp.sin(away) / location, (jnp.cos(away) - mean) / spread])
+    return jnp.stack([jnp.sin(away) / ratio, (jnp.cos(away) - mean) / spread])
 
 
 def von_mises_shift(p: Parameters, t: Parameters) -> jax.Array:
-    """Shift of the rows of a von Mises distribution."""
-    _, location, spread = von_mises_spread(p)
-    return jnp.stack([t["loc"] * location, t["concentration"] * spread])
+    """Shift of the rows of a von Mises distribution; of a location that tells nothing, none."""
+    _, ratio, spread = von_mises_spread(p)
+    return jnp.stack([t["loc"] * p["concentration"] * ratio, t["concentration"] * spread])
 
 
 def multivariate_normal_residual(p: Parameters, value: jax.Array) -> jax.Array:

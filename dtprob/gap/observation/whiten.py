@@ -14,6 +14,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
+from dtprob.gap.observation.discrete import probs_impossible
 from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.observation.recognise import recognised
 from dtprob.gap.observation.residuals import Parameters
@@ -66,10 +67,21 @@ def rewritten(observed: Observation, fn: Any, value: Any, name: str) -> Observat
 
 def log_prob(observed: Observation, value: jax.Array) -> jax.Array:
     """Elementwise log density, zero where masked; shape of the value."""
-    elementwise = likelihood(observed.family).log_prob
-    if elementwise is not None:
-        return observed.masked(elementwise(observed.parameters, value))
-    return observed.masked(distribution(observed).log_prob(_filled(observed, value)))
+    known = likelihood(observed.family)
+    if known.log_prob is not None:
+        return observed.masked(known.log_prob(observed.parameters, value))
+    value = _filled(observed, value)
+    if known.density is not None:
+        return observed.masked(known.density(observed.parameters, value))
+    return observed.masked(distribution(observed).log_prob(value))
+
+
+def impossible(observed: Observation, value: jax.Array) -> jax.Array:
+    """Which values that count cannot be, as a count where the rate is 0; shape of the value."""
+    found = ~(log_prob(observed, value) > -jnp.inf)
+    if observed.family in ("BernoulliProbs", "BinomialProbs"):
+        found |= probs_impossible(observed.parameters, value)
+    return observed.masked(found) > 0
 
 
 def _filled(observed: Observation, value: jax.Array) -> jax.Array:

@@ -32,22 +32,30 @@ class Scores(NamedTuple):
 
 
 def whitened(made: Likelihood, scores: Scores, move: Move | None) -> Likelihood:
-    """The likelihood with rows of unit covariance; a move of what goes with the first score alone moves the first row."""
+    """The likelihood with rows of unit covariance; a move of what goes with the first score alone moves the first row.
 
-    def root(p: Parameters) -> jax.Array:
+    Where the information is none or not finite, as where all of a mixture is certain, a row tells nothing.
+    """
+
+    def rooted(p: Parameters) -> tuple[jax.Array, jax.Array]:
+        """Roots of the information (*value, score, score), and where there is any (*value,)."""
         information = scores.information(p)
-        size = information.shape[-1]
-        ridge = _RIDGE * jnp.trace(information, axis1=-2, axis2=-1) / size
-        return jnp.linalg.cholesky(information + ridge[..., None, None] * jnp.eye(size))
+        size, trace = information.shape[-1], jnp.trace(information, axis1=-2, axis2=-1)
+        told = jnp.isfinite(information).all(axis=(-2, -1)) & (trace > 0)
+        ridge = _RIDGE * trace / size
+        held = information + ridge[..., None, None] * jnp.eye(size)
+        return jnp.linalg.cholesky(jnp.where(told[..., None, None], held, jnp.eye(size))), told
 
     def residual(p: Parameters, value: jax.Array) -> jax.Array:
-        columns = jnp.moveaxis(scores.of(p, value), 0, -1)[..., None]
-        return jnp.moveaxis(solve_triangular(root(p), columns, lower=True)[..., 0], -1, 0)
+        root, told = rooted(p)
+        columns = jnp.moveaxis(jnp.where(told, scores.of(p, value), 0.0), 0, -1)[..., None]
+        return jnp.moveaxis(solve_triangular(root, columns, lower=True)[..., 0], -1, 0)
 
     def shift(p: Parameters, change: Parameters) -> jax.Array:
-        return jnp.einsum("...ij,i...->j...", root(p), scores.change(p, change))
+        root, told = rooted(p)
+        return jnp.einsum("...ij,i...->j...", root, jnp.where(told, scores.change(p, change), 0.0))
 
-    relocate: Move | None = None if move is None else lambda p, step: move(p, step / root(p)[..., 0, 0])
+    relocate: Move | None = None if move is None else lambda p, step: move(p, step / rooted(p)[0][..., 0, 0])
     return replace(made, residual=residual, shift=shift, relocate=relocate)
 
 

@@ -3,7 +3,6 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 import pytest
 
 from dtprob.case import load_case
@@ -12,6 +11,7 @@ from dtprob.effects import catalogue
 from dtprob.effects.effect import FIELD
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
+from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace, fit
 from dtprob.models.declaration import declare
@@ -170,11 +170,16 @@ def test_a_predictor_without_bias_has_no_gap():
 
 def test_maps_of_whole_decibels_are_numbers_like_others():
     """Else no effect could move them by less than one."""
-    prediction = np.arange(-90, -60)
-    with numpyro.handlers.seed(rng_seed=0):
-        trace = numpyro.handlers.trace(label_twin).get_trace(np.zeros((30, 1)), prediction)
-    assert jnp.issubdtype(trace["predicted_label"]["value"].dtype, jnp.floating)
-    np.testing.assert_array_equal(trace["predicted_label"]["value"], prediction)
+    prediction, rng = np.arange(-90, -60), np.random.default_rng(0)
+    data = {"x": np.zeros((30, 1)), "y": jnp.asarray(prediction + rng.normal(size=30))}
+    whole, real = (
+        Problem(label_twin, data | {"prediction": jnp.asarray(kind)}, [])
+        for kind in (prediction, prediction.astype(float))
+    )
+    x = whole.prior_middle[0]
+    shift = {"predicted_label": jnp.full((1, 30), 0.3)}
+    np.testing.assert_allclose(x, real.prior_middle[0])
+    np.testing.assert_array_equal(*(np.asarray(one.compiled.shifted(x, shift, 1)) for one in (whole, real)))
 
 
 def test_labelled_rows():
