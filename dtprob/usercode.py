@@ -67,7 +67,7 @@ def _load_module(name: str, parts: list[str], folder: Path) -> ModuleType:
             raise InputError(f"module {name}", expected, "none of that name", "Check the name and the folder")
         try:
             return importlib.import_module(name)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             got = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
             raise InputError(f"module {name}", "a module that runs", got, "Correct the module") from error
 

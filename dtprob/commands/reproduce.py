@@ -7,6 +7,7 @@ from pathlib import Path
 
 import jax
 
+from dtprob.case import check_seed
 from dtprob.commands.run import session
 from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
@@ -31,9 +32,9 @@ def run(figure: str, out: Path, *, runs: int | None, seed: int, resume: bool) ->
     """
     if figure not in FIGURES:
         raise unknown_name("figure", figure, FIGURES, "figure")
-    if (runs is not None and runs < 1) or seed < 0:
-        got = f"runs {runs}, seed {seed}"
-        raise InputError("reproduce", "runs from 1 and a seed from 0", got, "Correct them")
+    if runs is not None and runs < 1:
+        raise InputError("--runs", "a number from 1", str(runs), "Correct it")
+    check_seed(seed)
     make_folder(out)
     with session() as say:
         module = importlib.import_module(FIGURES[figure])

@@ -52,9 +52,9 @@ def generate(
     """
     if track not in TRACKS:
         raise unknown_name("--track", track, TRACKS, "track")
-    if count < 1 or seed < 0:
-        got = f"count {count}, seed {seed}"
-        raise InputError("withheld generate", "a count from 1 and a seed from 0", got, "Correct them")
+    if count < 1:
+        raise InputError("--count", "a number from 1", str(count), "Correct it")
+    check_seed(seed)
     make_folder(out)
     from dtprob.commands.run import session  # noqa: PLC0415  (heavy)
 

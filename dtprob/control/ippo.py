@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from dtprob.control.critic import LocalCritic
 from dtprob.control.policy import Memory, choice_entropy, log_chance, unroll_each
-from dtprob.control.returns import device_returns
+from dtprob.control.returns import device_returns, normalised
 from dtprob.control.rollout import Trajectory
 
 
@@ -62,7 +62,7 @@ class IPPO:
         reward = trajectory.reward / self.scale
         returns, counts = device_returns(reward, value, trajectory.truncated, self.discount, self.mix)
         advantage = returns - value
-        advantage = (advantage - jnp.mean(advantage)) / (jnp.std(advantage) + 1e-6)
+        advantage = normalised(advantage, counts)
         entropy = self.entropy * jnp.maximum(0.0, 1 - 1.5 * progress)
         rate = self.rate * (1 - 0.9 * progress)
 

@@ -64,3 +64,18 @@ def counterfactual_advantage(
     chance = jax.nn.sigmoid(logit)
     average = (1 - chance) * value[..., 0] + chance * value[..., 1]
     return jnp.where(action > 0, value[..., 1], value[..., 0]) - average
+
+
+def normalised(
+    advantage: Float[Array, "slot environment device"], counts: Bool[Array, "slot environment"]
+) -> Float[Array, "slot environment device"]:
+    """Advantages to mean 0 and standard deviation 1 over the slots that count; those of guessed slots are 0.
+
+    Args:
+        advantage: of every device.
+        counts: where it is more than a guess, as `device_returns` says.
+    """
+    known = jnp.broadcast_to(counts[..., None], advantage.shape)
+    size = jnp.maximum(jnp.sum(known), 1)
+    offset = jnp.where(known, advantage - jnp.sum(advantage, where=known) / size, 0.0)
+    return offset / (jnp.sqrt(jnp.sum(offset**2) / size) + 1e-6)

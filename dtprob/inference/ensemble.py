@@ -233,8 +233,18 @@ class Ensemble(AbstractEngine):
 
 
 def _places(target: Target, values: Mapping[str, Array], inputs: Inputs) -> Float[Array, "draw dimension"]:
-    """The coordinates of draws of all latent sites."""
-    return jax.lax.map(lambda value: target.prior_median(inputs, value), dict(values))
+    """The coordinates of draws of all latent sites; of one rounded to the edge of its support, the outermost ones."""
+    outermost = jnp.finfo(inputs.scale.dtype)
+    low, high = (
+        (edge - inputs.location) / inputs.scale
+        for edge in jnp.log(jnp.array([outermost.tiny, 1 / outermost.eps]))
+    )
+
+    def one(value: dict[str, Array]) -> Array:
+        u = target.unconstrained(jax.random.key(0), inputs, value)
+        return jnp.where(jnp.isposinf(u), high, jnp.where(jnp.isneginf(u), low, u))
+
+    return jax.lax.map(one, dict(values))
 
 
 def _resampled(target: Target, scheme: Scheme, fitted: Array, key: PRNGKeyArray, inputs: Inputs) -> Inputs:

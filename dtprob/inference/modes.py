@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, Scalar
 
 from dtprob.errors import InputError
 from dtprob.inference.optimise import Optimum, best, minimise
-from dtprob.inference.target import Inputs, Target
+from dtprob.inference.target import PRIOR_DRAWS, Inputs, Target
 from dtprob.models.supported import differentiated_forwards
 
 type Objective = Literal["density", "map", "maximum_likelihood"]
@@ -138,8 +138,17 @@ def starting_points(
     """
     if starts == 1:
         return target.once(_median)(inputs, values)
-    drawn = target.once(Target.prior_draws)(key, inputs, values)
+    drawn = _candidates(target, inputs, key, values, _CANDIDATES * (starts - 1))
     return target.once(_chosen, objective, starts)(drawn, inputs, values)
+
+
+def _candidates(
+    target: Target, inputs: Inputs, key: PRNGKeyArray, values: Mapping[str, Array], least: int
+) -> Float[Array, "draw dimension"]:
+    """Prior draws, this many or more, in blocks of one compiled size."""
+    draw = target.once(Target.prior_draws)
+    keys = [key, *(jax.random.fold_in(key, block) for block in range(1, -(-least // PRIOR_DRAWS)))]
+    return jnp.concatenate([draw(own, inputs, values) for own in keys])
 
 
 def _median(target: Target, inputs: Inputs, values: Mapping[str, Array]) -> Float[Array, "1 dimension"]:

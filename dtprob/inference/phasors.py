@@ -8,8 +8,8 @@ of the angles.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -115,15 +115,35 @@ def _prior_parameter(target: Target, rest: Array, inputs: Inputs) -> Float[Array
 
 
 def _observations(target: Target, angles: Array, rest: Array, inputs: Inputs) -> tuple[Array, Array, Array]:
-    """Data, means and weights (one over the variance) of all observations, as real vectors."""
+    """Data, means and weights (one over the variance, 0 where masked) of all observations, as real vectors."""
     _, trace = target.trace(rest.at[target.angles].set(angles), inputs)
     parts: list[tuple[Array, Array, Array]] = []
     for name in target.declaration.observed:
         fn, value = trace[name]["fn"], jnp.asarray(trace[name]["value"])
-        mean, weight = jnp.broadcast_to(fn.mean, value.shape), jnp.broadcast_to(1 / fn.variance, value.shape)
+        mean = jnp.broadcast_to(fn.mean, value.shape)
+        weight = jnp.broadcast_to(_counted(trace[name]) / fn.variance, value.shape)
+        value = jnp.where(weight > 0, value, mean)
         if jnp.iscomplexobj(value):
             parts += [(value.real, mean.real, 2 * weight), (value.imag, mean.imag, 2 * weight)]
         else:
             parts.append((value, mean, weight))
     data, means, weights = zip(*parts, strict=True)
     return tuple(jnp.concatenate([x.ravel() for x in xs]) for xs in (data, means, weights))  # pyright: ignore[reportReturnType]
+
+
+def _counted(message: Mapping[str, Any]) -> Array:
+    """How often each entry of an observed site counts: its scale, and 0 where it is masked."""
+    fn, scale = message["fn"], message["scale"]
+    counted = _over_event(1.0 if scale is None else scale, fn)
+    while hasattr(fn, "base_dist"):
+        mask = getattr(fn, "_mask", None)  # of a MaskedDistribution, which shows it nowhere else
+        if mask is not None:
+            counted = counted * _over_event(mask, fn)
+        fn = fn.base_dist
+    return counted
+
+
+def _over_event(value: Any, fn: Any) -> Array:
+    """Numbers per batch entry, alike for all that one event holds."""
+    array = jnp.asarray(value, float)
+    return array.reshape(*array.shape, *[1] * len(fn.event_shape))

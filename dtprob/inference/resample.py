@@ -86,15 +86,21 @@ def cluster_axis(declaration: Declaration) -> tuple[str, int]:
     """The plate of the model's independent clusters, and how many there are.
 
     Raises:
-        InputError: no observed site lies in the plate.
+        InputError: no observed site lies in the plate, or one lies outside, which could not be resampled.
     """
-    name = declaration.cluster
-    for site in declaration.observed.values():
-        if name in site.plates and name in site.axes:
-            return name, site.shape[site.axes.index(name)]
+    name, what = declaration.cluster, f"ensemble on model {declaration.name}"
+    inside = [site for site in declaration.observed.values() if name in site.plates and name in site.axes]
+    outside = [site.name for site in declaration.observed.values() if site not in inside]
+    if inside and outside:
+        remedy = "Put it into the plate, or resample with noise"
+        raise InputError(
+            what, f"every observed site in the plate {name!r}", f"{outside[0]!r} outside", remedy
+        )
+    if inside:
+        return str(name), inside[0].shape[inside[0].axes.index(str(name))]
     expected = "a plate of independent clusters around an observed site"
     remedy = "Put the observations into a plate, or name one as the model's cluster"
-    raise InputError(f"ensemble on model {declaration.name}", expected, str(name), remedy)
+    raise InputError(what, expected, str(name), remedy)
 
 
 def cluster_weights(scheme: Scheme, key: PRNGKeyArray, count: int) -> Float[Array, " cluster"]:

@@ -20,7 +20,7 @@ import numpy as np
 from blackjax.mcmc import hmc
 from blackjax.smc import adaptive_tempered, resampling
 from blackjax.smc.tempered import TemperedSMCState
-from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, Scalar
 from scipy.special import logsumexp
 
 from dtprob.errors import InputError
@@ -29,6 +29,7 @@ from dtprob.inference.build import build_target
 from dtprob.inference.circular import wrap
 from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
 from dtprob.inference.iterate import Job, Steps, iterate
+from dtprob.inference.modes import nowhere_finite
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
@@ -130,14 +131,20 @@ class SMC(AbstractEngine):
 
     def _steps(self, target: Target, inputs: Inputs, key: PRNGKeyArray) -> Steps[Swarm]:
         """A step is a temperature; a run ends with moves at the posterior itself."""
-        fresh = target.compiled(_from_prior, self.draws)
+        draw = target.compiled(_from_prior, self.draws)
         move = target.compiled(_temper, self.moves, self.leapfrog, self.target_ess)
 
         def key_of(run: Any, stage: Any) -> PRNGKeyArray:
             return jax.random.fold_in(jax.random.fold_in(key, run), stage)
 
+        def fresh(run: Any) -> Float[Array, "particle dimension"]:
+            particles, is_possible = draw(key_of(run, 0), inputs)
+            if not is_possible:
+                raise nowhere_finite(target)
+            return particles
+
         def begin() -> Swarm:
-            particles = fresh(key_of(0, 0), inputs)
+            particles = fresh(0)
             nothing = jnp.zeros(self.chains, particles.dtype)
             kept = jnp.zeros((self.chains, *particles.shape), particles.dtype)
             zero = jnp.zeros((), int)
@@ -145,7 +152,7 @@ class SMC(AbstractEngine):
             return _anew(swarm, particles)
 
         def step(_: int, before: Swarm) -> tuple[Swarm, dict[str, Any]]:
-            if before.stage >= self.max_temperatures:
+            if before.temperature < 1 and before.stage >= self.max_temperatures:
                 expected = f"the posterior within {self.max_temperatures} temperatures"
                 got = f"the likelihood to the power {float(before.temperature):.3g}"
                 remedy = "Raise max_temperatures, or the number of particles"
@@ -159,7 +166,7 @@ class SMC(AbstractEngine):
                 acceptance=moved.acceptance.at[before.run].set(acceptance),
                 run=before.run + 1,
             )
-            return _anew(moved, fresh(key_of(moved.run, 0), inputs)), row
+            return _anew(moved, fresh(moved.run)), row
 
         return Steps(
             begin,
@@ -175,9 +182,16 @@ class SMC(AbstractEngine):
 
 def _from_prior(
     target: Target, count: int, key: PRNGKeyArray, inputs: Inputs
-) -> Float[Array, "particle dimension"]:
+) -> tuple[Float[Array, "particle dimension"], Bool[Array, ""]]:
+    """Draws from the prior, and whether the data are possible under any of them."""
+
+    def one(key: PRNGKeyArray) -> tuple[Array, Array]:
+        u = target.prior_draw(key, inputs)
+        return u, jnp.isfinite(target.log_terms(u, inputs).likelihood)
+
     keys = jax.vmap(jax.random.fold_in, (None, 0))(key, jnp.arange(count))
-    return jax.lax.map(lambda k: target.prior_draw(k, inputs), keys, batch_size=_BATCH)
+    particles, possible = jax.lax.map(one, keys, batch_size=_BATCH)
+    return particles, jnp.any(possible)
 
 
 def _anew(swarm: Swarm, particles: Float[Array, "particle dimension"]) -> Swarm:

@@ -86,11 +86,11 @@ class SVI(AbstractEngine):
     """Stochastic variational inference: von Mises factors for angles, a normal for the rest.
 
     The posterior's `extra` has `elbo` (evidence lower bound, nats) with its `elbo_history`, `converged`
-    (whether the bound stopped rising at every rate), `pareto_k` (the tail index of the importance weights:
-    above 0.7 the guide misses part of the posterior, and its draws are not to be trusted; minus infinity
-    where all weights are equal, nan of fewer than 25 draws), `log_evidence` (from these weights) and
-    `concentration.<site>` for each circular site. The statistic `log_weight` is log posterior less log guide,
-    for weighing draws anew.
+    (whether the bound stopped rising at every rate, and the density is finite at every draw), `pareto_k` (the
+    tail index of the importance weights: above 0.7 the guide misses part of the posterior, and its draws are not
+    to be trusted; minus infinity where all weights are equal, nan of fewer than 25 draws), `log_evidence` (from
+    these weights) and `concentration.<site>` for each circular site. The statistic `log_weight` is log posterior
+    less log guide, for weighing draws anew.
 
     Attributes:
         draws: how many draws of the guide.
@@ -146,7 +146,7 @@ class SVI(AbstractEngine):
             extra={
                 "elbo": weights.mean(),
                 "elbo_history": history["elbo"],
-                "converged": int(ascent.falls) >= self.falls,
+                "converged": bool(int(ascent.falls) >= self.falls and np.isfinite(weights).all()),
                 **weight_facts(weights),
                 **_concentrations(target, ascent),
             },

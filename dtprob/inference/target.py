@@ -211,10 +211,10 @@ class Target:
 
         An entry fixed on the edge of its support, where its coordinate is infinite, is drawn from the prior.
         """
-        drawn = self._unconstrained(key, inputs, {})
+        drawn = self.unconstrained(key, inputs, {})
         if not values:
             return drawn
-        fixed = self._unconstrained(key, inputs, values)
+        fixed = self.unconstrained(key, inputs, values)
         return jnp.where(jnp.isfinite(fixed), fixed, drawn)
 
     def prior_draws(
@@ -229,7 +229,7 @@ class Target:
         median = jnp.zeros(self.dimension)
         if not values:
             return median
-        fixed = self._unconstrained(jax.random.key(0), inputs, values)
+        fixed = self.unconstrained(jax.random.key(0), inputs, values)
         given = jnp.concatenate(
             [jnp.full(c.stop - c.start, n in values) for n, c in self.coordinates.items()]
         )
@@ -250,9 +250,10 @@ class Target:
                 kept[name] = _shaped(name, value, latent[name].shape)
         return kept
 
-    def _unconstrained(
+    def unconstrained(
         self, key: PRNGKeyArray, inputs: Inputs, values: Mapping[str, Any]
     ) -> Float[Array, " dimension"]:
+        """Coordinates of constrained values, infinite on the edge of a support; other sites drawn from the prior."""
         trace = trace_model(self.model, self.data(inputs), key, values)
         free = {name: free_value(trace[name]) for name in self.coordinates}
         return (self.ravel(free) - inputs.location) / inputs.scale

@@ -31,7 +31,11 @@ def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
 def difference_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     """Data less twin along each column of the data, in their own unit, with its sign."""
     data = group(gap, "differences", report)
-    return [_difference_chart(data, i) for i in range(len(data.dims))]
+    return [
+        _difference_chart(data, i)
+        for i in range(len(data.dims))
+        if (data[f"before_{i}"] + data[f"spread_{i}"]).count()
+    ]
 
 
 def _difference_chart(data: xr.Dataset, index: int) -> Chart:
@@ -47,7 +51,7 @@ def _difference_chart(data: xr.Dataset, index: int) -> Chart:
         threshold=limit,
         amount=f"Data less twin ({unit})" if unit else "Data less twin",
     )
-    far = int(np.argmax(np.abs(before) - limit))
+    far = int(np.nanargmax(np.abs(before) - limit))
     caption = (
         f"{name}: above 0 the data ({words(str(said['observed']))}) are larger than the twin says, on average. "
         "Grey: where all values along all columns stay, in 95 of 100 cases, when the twin is right."
@@ -57,7 +61,7 @@ def _difference_chart(data: xr.Dataset, index: int) -> Chart:
 
 
 def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) -> Chart:
-    shown = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data]]
+    shown = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data and data[name].count()]]
     place, unit = _places(shown[_BEFORE + axis], axis)
     complete = shown.assign_coords(place=(axis, place)).dropna(axis)
     before, after, place = complete[_BEFORE + axis], complete.get(_AFTER + axis), complete["place"].values
@@ -114,7 +118,9 @@ def closed_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     data = group(gap, "where", report)
     if not report["causes"]:
         return []
-    axes = [name[len(_EXPECTED) :] for name in map(str, data) if name.startswith(_EXPECTED)]
+    axes = [
+        name[len(_EXPECTED) :] for name in map(str, data) if name.startswith(_EXPECTED) and data[name].count()
+    ]
     uneven = {axis: float(data[_EXPECTED + axis].max()) * data.sizes[axis] for axis in axes}
     return [_closed_chart(data, axis) for axis in sorted(axes, key=lambda a: -uneven[a])[:_MOST_SHARES]]
 

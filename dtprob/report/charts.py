@@ -83,6 +83,8 @@ def plan_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     if not {"rx_position", "tx_position", "before"} <= set(data):
         return []
     data = data.dropna(str(data["before"].dims[0]))
+    if not data["before"].size:
+        return []
     views = [name for name in ("before", "after") if name in data]
     classes = classes_for(*(data[name].values for name in views))
     return [

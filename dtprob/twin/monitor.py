@@ -30,7 +30,7 @@ class Watch:
         alarm: where the statistic exceeds the calibrated threshold.
         evidence: log e-value for a change of each factor in each window; without draws of what a change may bring none.
         detector: log of the sequential detector over all factors.
-        run_length: mean windows to a false alarm that the sequential detector is set to.
+        run_length: mean windows to a false alarm that the sequential detector is set to; see `Monitor`.
     """
 
     statistic: Float[np.ndarray, " window"]
@@ -62,6 +62,11 @@ class Watch:
 @dataclass(frozen=True)
 class Monitor:
     """A model with what was learned of it, watching windows of new data.
+
+    The run length holds for windows that each come from the draws' own mixture, a new draw for each window. A twin has one
+    parameter, near the draws at best: where few data told them and this one lies far out, each window is a little more
+    likely under a change, and false alarms come sooner. More data of the learning phase bring both together. The rate
+    of `alarm` has no such condition: it is calibrated on held-out windows.
 
     Attributes:
         model: a NumPyro model whose clusters are the windows.

@@ -185,6 +185,16 @@ def test_a_wrong_seed_costs_no_answers(tmp_path, capsys):
     assert (answer / "report.json").is_file()
 
 
+@pytest.mark.parametrize(
+    "words", [["withheld", "generate", "--track", "labels", "--count", "1"], ["reproduce", "fig2"]]
+)
+@pytest.mark.parametrize("seed", [-1, 2**63])
+def test_a_seed_that_no_key_can_be_made_of_is_refused(tmp_path, capsys, words, seed):
+    assert main([*words, "--out", str(tmp_path / "new"), "--seed", str(seed)]) == 2
+    assert f"--seed: expected a whole number from 0, got {seed}" in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
 def test_a_case_that_breaks_off_keeps_no_older_failure(tmp_path, monkeypatch):
     """A score would count that failure, though this run has not ended."""
     own, answer = _one_case(tmp_path)

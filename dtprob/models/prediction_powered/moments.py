@@ -150,7 +150,7 @@ def _unlabelled(
     for sums in _all_sums(loss, sample, theta, n_context):
         total = sums if total is None else each_part(add, total, sums)
     if total is None or not all(np.isfinite(part).all() for part in total if part is not None):
-        _locate(sample)
+        locate(sample)
         raise InputError(
             "loss",
             "finite values at every sample",
@@ -258,7 +258,7 @@ def _over_predictors(function: Callable[[Any], Any], prediction: Values) -> Any:
 _chunk_sums = eqx.filter_jit(group_sums)
 
 
-def _locate(sample: Sample) -> None:
+def locate(sample: Sample) -> None:
     """Raise an error that names the first unlabelled sample that is not finite, if there is one."""
     for number, chunk in enumerate(sample.chunks()):
         for name, array in (("x_unlabelled", chunk.x), ("prediction_unlabelled", chunk.prediction)):

@@ -17,7 +17,7 @@ from scipy import optimize, stats
 
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.losses import check_scalar
-from dtprob.models.prediction_powered.moments import Evaluation, Group
+from dtprob.models.prediction_powered.moments import Evaluation, Group, locate
 from dtprob.models.prediction_powered.result import Estimate
 from dtprob.models.prediction_powered.sample import Sample
 from dtprob.models.prediction_powered.schemes import Scheme
@@ -104,6 +104,8 @@ def _steps(sample: Sample) -> Steps:
     weight, y = sample.labelled_weight, sample.y
     prediction = y if sample.prediction is None else sample.prediction
     blocks = list(sample.blocks()) if sample.has_predictions else []
+    if not all(np.isfinite(block.prediction).all() for block in blocks):
+        locate(sample)
     unlabelled = np.concatenate([block.prediction for block in blocks]) if blocks else np.zeros((0, 1))
     weights = np.concatenate([block.weight for block in blocks]) if blocks else np.zeros(0)
     folds, count = unlabelled.shape[1], max(sample.n_unlabelled, 1)

@@ -13,7 +13,7 @@ from dtprob.control import COMA, IPPO, Budget, FramePolicy, HistoryPolicy, tabul
 from dtprob.control.coma import actor_loss, critic_loss, values
 from dtprob.control.critic import CentralCritic
 from dtprob.control.environment import Observation
-from dtprob.control.returns import counterfactual_advantage, lambda_returns
+from dtprob.control.returns import counterfactual_advantage, lambda_returns, normalised
 from dtprob.control.rollout import Trajectory, begin, play
 from dtprob.errors import InputError
 from dtprob.physical.multi_access import aloha, average, chain
@@ -177,3 +177,14 @@ def test_a_budget_that_teaches_nothing_is_refused():
     """The return of a trajectory's last slot is a guess: with one slot between two updates nothing would be learned."""
     with pytest.raises(InputError, match="length: expected 2 or more, got 1"):
         train(KEY, COMA(), FramePolicy(KEY, 2), world(PAIR), Budget(100, 4, 1))
+
+
+def test_guessed_slots_take_no_part_in_the_scale_of_advantages():
+    """By NumPy over the slots that count; where none does, nothing is learned."""
+    advantage = np.random.default_rng(0).normal(3.0, 2.0, size=(6, 2, 3))
+    counts = np.arange(12).reshape(6, 2) % 3 > 0
+    advantage[~counts] = 0.0  # what `device_returns` leave there
+    known = advantage[counts]
+    expected = np.where(counts[..., None], (advantage - known.mean()) / (known.std() + 1e-6), 0.0)
+    np.testing.assert_allclose(normalised(jnp.array(advantage), jnp.array(counts)), expected, atol=1e-9)
+    assert not np.any(normalised(jnp.array(advantage), jnp.zeros((6, 2), bool)))

@@ -11,6 +11,7 @@ from scipy import stats
 from dtprob.errors import InputError
 from dtprob.inference import Ensemble
 from dtprob.inference.build import build_target
+from dtprob.inference.ensemble import _places
 from dtprob.inference.resample import chosen_scheme
 from tests.unit.inference.examples import (
     at_the_cut,
@@ -142,3 +143,34 @@ def test_any_engine_can_be_the_base():
     assert np.all(np.abs(draws.mean(0) - mean) < 4 * np.sqrt(2 * np.diag(covariance) / 40))
     with pytest.raises(InputError, match="base of engine ensemble"):
         Ensemble(base="ensemble")(KEY, linear, data)
+
+
+def test_a_draw_on_the_edge_of_its_support_stays_there():
+    """An engine's draw was rounded to the edge, where its coordinate is infinite; it is not the prior's median."""
+
+    def edged(y=None):
+        share = numpyro.sample("share", dist.Uniform(2.0, 3.0))
+        scale = numpyro.sample("scale", dist.LogNormal(0.0, 1.0))
+        numpyro.sample("y", dist.Normal(share, scale), obs=y)
+
+    target, inputs = build_target(edged, {"y": jnp.zeros(())})
+    values = {"share": jnp.asarray([2.0, 3.0, 2.3]), "scale": jnp.asarray([1.0, 0.0, 2.0])}
+    positions = _places(target, values, inputs)
+    assert np.isfinite(positions).all()
+    back = [target.constrain(u, inputs) for u in positions]
+    for name, value in values.items():
+        np.testing.assert_allclose([one[name] for one in back], value, rtol=1e-6, atol=1e-6)
+
+
+def test_what_lies_outside_of_the_resampled_plate_is_refused():
+    """It would count as data without any noise, and the draws would be too narrow."""
+
+    def beside(y=None, z=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("row", 4):
+            numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+        numpyro.sample("z", dist.Normal(level, 1.0), obs=z)
+
+    data = {"y": jnp.zeros(4), "z": jnp.zeros(())}
+    with pytest.raises(InputError, match="every observed site in the plate 'row', got 'z' outside"):
+        Ensemble(resample="weights")(KEY, beside, data)

@@ -90,3 +90,18 @@ def test_what_it_cannot_do_is_an_error():
         SMC(**SHORT, max_temperatures=1)(KEY, normal, normal_data())
     with pytest.raises(InputError, match="target_ess of engine smc: expected between 0 and 1"):
         SMC(target_ess=1.5)(KEY, normal, normal_data())
+
+
+def test_the_last_temperature_that_is_allowed_may_be_the_posterior():
+    temperatures = SMC(**SHORT, chains=1)(KEY, normal, normal_data()).extra["temperatures"]
+    just = SMC(**SHORT, chains=1, max_temperatures=len(temperatures) - 1)(KEY, normal, normal_data())
+    np.testing.assert_array_equal(just.extra["temperatures"], temperatures)
+
+
+def test_data_that_no_draw_of_the_prior_allows_are_refused_before_the_first_temperature():
+    """With NaN it went on to the last temperature that it was given."""
+    data = {**normal_data(), "y": np.full(12, np.nan)}
+    with pytest.raises(
+        InputError, match="model normal: expected a finite log density, got none at any start"
+    ):
+        SMC(**SHORT, chains=1, max_temperatures=3)(KEY, normal, data)

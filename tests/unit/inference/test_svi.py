@@ -1,6 +1,7 @@
 """Variational inference: exact where the guide holds the posterior, and honest where it does not."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
@@ -78,3 +79,15 @@ def test_weights_of_known_tails():
         assert weight_facts(-index * np.log(uniform))["pareto_k"] == pytest.approx(index, abs=0.15)
     assert weight_facts(np.full(100, -3.0)) == {"pareto_k": -np.inf, "log_evidence": pytest.approx(-3.0)}
     assert np.isnan(weight_facts(np.zeros(10))["pareto_k"])
+
+
+def test_a_bound_that_is_no_number_has_not_converged():
+    """The density is NaN for a third of the prior."""
+
+    def torn(y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        numpyro.sample("y", dist.Normal(jnp.where(level > 0.5, jnp.nan, level), 1.0), obs=y)
+
+    found = SVI(draws=100, steps=400, falls=1, starts=1)(KEY, torn, {"y": jnp.asarray(0.4)}).extra
+    assert not np.isfinite(found["elbo"])
+    assert not found["converged"]

@@ -1,5 +1,7 @@
 """The target: density, Jacobian, coordinates, data as arguments, and models that it refuses."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,6 +14,7 @@ from scipy import integrate, stats
 from dtprob.errors import InputError
 from dtprob.inference.build import build_target
 from dtprob.inference.laplace import Laplace
+from dtprob.inference.modes import starting_points
 from dtprob.inference.target import Target
 from tests.unit.inference.examples import at_the_cut, at_the_cut_data, normal, normal_data
 
@@ -262,3 +265,28 @@ def test_single_precision():
         posterior = Laplace(draws=100)(KEY, normal, normal_data())
     assert posterior.draws["level"].dtype == np.float32
     assert bool(posterior.extra["converged"])
+
+
+def test_more_starts_than_a_block_of_prior_draws_has():
+    """Each is a start of its own, and those of few starts are the same as before."""
+    target, inputs = build_target(normal, normal_data())
+    find = functools.partial(
+        starting_points, target, inputs, jax.random.key(1), objective="density", values={}
+    )
+    assert len(np.unique(find(starts=100))) == 100
+    drawn = target.prior_draws(jax.random.key(1), inputs, {})
+    density = np.asarray([target.log_density(u, inputs) for u in drawn])
+    best = np.asarray(drawn)[np.argsort(-density)[:16]]
+    np.testing.assert_allclose(find(starts=17)[1:], best, rtol=1e-5)
+
+
+def test_a_site_with_obs_mask_is_refused():
+    """NumPyro leaves the entries that were observed a latent twin whose density is one everywhere."""
+
+    def split(seen, y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("row", 3):
+            numpyro.sample("y", dist.Normal(level, 1.0), obs=y, obs_mask=seen)
+
+    with pytest.raises(InputError, match="observed site 'y': expected no obs_mask, got one"):
+        build_target(split, {"seen": np.array([True, False, True]), "y": np.zeros(3)})

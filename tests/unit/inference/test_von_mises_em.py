@@ -8,12 +8,15 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 import pytest
+from numpyro import handlers
 from scipy.special import i0e, i1e
 
 from dtprob.errors import InputError
 from dtprob.inference import VonMisesEM
 from dtprob.inference.build import build_target
-from dtprob.inference.relaxation import Resultants, expected_log_joint, find_layout, quadratic
+from dtprob.inference.phasors import least_squares_start, reference_phases
+from dtprob.inference.relaxation import Layout, Resultants, expected_log_joint, find_layout, quadratic
+from dtprob.models.complex_normal import ComplexNormal
 from tests.unit.inference.examples import normal, normal_data, phase_errors, phase_errors_data
 
 KEY = jax.random.key(31)
@@ -237,3 +240,32 @@ def test_a_sharp_angle_hides_none_of_another_kind():
     data = {"y": jnp.full(100, 0.8), "c": jnp.asarray(1)}
     with pytest.raises(InputError, match="another dependence on 'other'"):
         VonMisesEM()(jax.random.key(0), model, data)
+
+
+def partly(response, seen, times, h=None):
+    """Phase errors, some of whose observations are masked, and all count several times."""
+    with numpyro.plate("path", response.shape[0]):
+        phase = numpyro.sample("phase", dist.VonMises(0.0, 2.0))
+    mean = jnp.exp(1j * phase) @ response
+    with numpyro.plate("frequency", response.shape[1]), handlers.mask(mask=seen), handlers.scale(scale=times):
+        numpyro.sample("h", ComplexNormal(mean, 0.1), obs=h)
+
+
+def first_e_steps(response, seen, times, h):
+    """Directions and concentrations by least squares."""
+    target, inputs = build_target(partly, {"response": response, "seen": seen, "times": times, "h": h})
+    layout = Layout(jnp.arange(3)[None], jnp.ones((1, 3)))
+    start = least_squares_start(target, layout, jnp.zeros(3), inputs)
+    return [start.direction, start.length, *reference_phases(target, layout, jnp.zeros(3), inputs)]
+
+
+def test_least_squares_leave_out_what_is_masked_and_repeat_what_is_scaled():
+    """Phases from masked or scaled observations are those from the others alone, or from each of them twice."""
+    data, _ = phase_errors_data(links=1, paths=3)
+    response, h, seen = data["response"][0], data["h"][0], np.arange(12) < 8
+    masked = first_e_steps(response, seen, 1.0, np.where(seen, h, np.nan))
+    few = first_e_steps(response[:, :8], seen[:8], 1.0, h[:8])
+    scaled = first_e_steps(response, seen | True, 2.0, h)
+    twice = first_e_steps(np.tile(response, 2), np.tile(seen | True, 2), 1.0, np.tile(h, 2))
+    for found, expected in zip([*masked, *scaled], [*few, *twice], strict=True):
+        np.testing.assert_allclose(found, expected, rtol=1e-6, atol=1e-6)

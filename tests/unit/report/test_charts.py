@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from dtprob.report.axis_charts import closed_charts, coordinate_charts
+from dtprob.report.axis_charts import closed_charts, coordinate_charts, difference_charts
 from dtprob.report.charts import plan_charts
 
 
@@ -82,3 +82,26 @@ def test_the_map_of_links_has_the_unit_of_its_numbers() -> None:
     (chart,) = plan_charts(report, gap)
     assert "Excess of each link (nats per observation)" in chart.svg
     assert "median excess 0.250 nats per observation, worst 0.500 at x 3.0 m, y 4.0 m" in chart.svg
+
+
+def test_nothing_is_drawn_where_there_are_no_numbers() -> None:
+    """What was nowhere observed, and what could not be told after a cause."""
+    report: Any = {"verdict": "FOUND", "where": {"coordinates": []}, "gap": {"after": 1.0}, "causes": [1]}
+    nothing, some = np.full(2, np.nan), np.array([0.5, 1.0])
+    ends = {f"{end}_position": (("link", "direction"), np.arange(6.0).reshape(2, 3)) for end in ("rx", "tx")}
+    told = {"column": "x", "observed": "y", "unit": "", "of": 2}
+    place = {"place_0": ("place", some, told), "before_0": ("place", nothing), "spread_0": ("place", nothing)}
+    where = {
+        "gap_link": ("link", some),
+        "gap_after_link": ("link", nothing),
+        "closed_link": ("link", nothing, {"nats": 1.0}),
+        "closed_expected_link": ("link", nothing),
+    }
+    groups = {"links": {"before": ("link", nothing), **ends}, "differences": place, "where": where}
+    gap = xr.DataTree.from_dict({name: xr.Dataset(value) for name, value in groups.items()})
+    assert plan_charts(report, gap) == []
+    assert difference_charts(report, gap) == []
+    assert closed_charts(report, gap) == []
+    (chart,) = coordinate_charts(report, gap)
+    assert "before, the highest excess" in chart.svg
+    assert "after" not in chart.svg

@@ -108,6 +108,14 @@ CALLS = {
         lambda: train(KEY, "ppi", 3, x=X, y=Y, x_unlabelled=X),
         "predictor: expected methods fit and predict",
     ),
+    "unlabelled NaN of a quantile": (
+        lambda: estimate(
+            Quantile(0.5),
+            Sample(y=Y, prediction=Y, prediction_unlabelled=np.where(Y == 4, np.nan, Y)),
+            "ppi",
+        ),
+        "prediction_unlabelled: expected finite numbers, got NaN or infinity at sample 4",
+    ),
     "unlabelled NaN": (
         lambda: estimate(
             "mean", Sample(y=Y, prediction=Y, prediction_unlabelled=np.where(Y == 4, np.nan, Y)), "ppi"
