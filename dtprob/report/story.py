@@ -151,21 +151,31 @@ def _no_gap(report: Report) -> Story:
     screened = report.get("screening", [])
     untold = [row for row in screened if row.get("absorbed_by")]
     unseen = sum(row.get("absorbed_by") == UNSEEN for row in untold)
-    tried = f"{len(screened) - len(untold)} known effects were tried; none of them is needed to explain these data, and"
+    judged = len(screened) - len(untold)
     beside = ""
     if absorbed := len(untold) - unseen:
-        beside = f" {absorbed} more could not be judged, because fitted parameters of the twin take up the same change."
+        more = " more" * (judged > 0)
+        beside = f" {absorbed}{more} could not be judged, because fitted parameters of the twin take up the same change."
     if unseen:
         beside += f" {unseen} could not be judged, because nothing that was observed depends on them."
     return Story(
         "No gap found",
         "good",
         "Nothing found: the twin agrees with the data.",
-        f"{tried} nothing else was left over.{beside} {_seen(report['detectable'])}"
+        f"{_tried(judged)}{beside} {_seen(report['detectable'])}"
         if screened
         else "No effects were given to try; the twin's own quantities differ from the data by no more than chance.",
         "Nothing to change in the twin.",
     )
+
+
+def _tried(judged: int) -> str:
+    """That so many effects were tried and none is needed."""
+    if not judged:
+        return "No known effect could be tried; nothing was left over."
+    one = "1 known effect was tried; it is not"
+    many = f"{judged} known effects were tried; none of them is"
+    return f"{one if judged == 1 else many} needed to explain these data, and nothing else was left over."
 
 
 def _tolerated(report: Report) -> Story:
@@ -281,7 +291,8 @@ def _beyond(report: Report) -> str:
 def _undetermined(report: Report) -> Story:
     names = [together(effects) for effects in rivals(report)]
     step = next_step(report)
-    wait = f" First: {step[:1].lower() + step[1:].rstrip('.')}." if step else ""
+    resolves, more = _decides(report["next_measurement"])
+    wait = f" {f'First: {step[:1].lower()}{step[1:]}' if resolves else step}" if step else ""
     if len(names) > 1:
         headline = f"There is a gap, but the data cannot tell {listing(names, 'from')}."
         meaning = "The gap is real, and none of these explanations can be ruled out. Choosing one now would be a guess."
@@ -292,10 +303,18 @@ def _undetermined(report: Report) -> Story:
             "did not hold on data that its fit had left out" if names else "is not enough to name an effect"
         )
         meaning = (
-            f"What was found {held}. It may be chance, or an effect too small for this amount of data; "
-            "more data of the same kind would decide."
+            f"What was found {held}. It may be chance, or an effect too small for this amount of data"
+            f"{'; more data of the same kind would decide' * more}."
         )
     return Story("Cause undecided", "partly", headline, meaning, f"Do not change the twin yet.{wait}")
+
+
+def _decides(plan: Mapping[str, Any] | str | None) -> tuple[bool, bool]:
+    """Whether a proposed measurement decides, and whether more data of the same kind do, unless the plan denies it."""
+    if not isinstance(plan, Mapping):
+        return True, True
+    resolves = bool(plan.get("resolves", True))
+    return resolves, resolves and plan.get("cost_of_all_again", 0.0) is not None
 
 
 def _named(cause: Cause) -> str:

@@ -1,5 +1,7 @@
 """Words for names, sizes and verdicts."""
 
+import pytest
+
 from dtprob.gap.fitting import soundness
 from dtprob.report import names
 from dtprob.report.advice import ADVICE, family
@@ -327,3 +329,48 @@ def test_effects_that_were_not_looked_for_any_more_are_told() -> None:
 def test_shares_below_nothing_are_told_as_they_are() -> None:
     assert names.shares({"low": -0.2, "high": 0.4}) == "\u221220 to 40%"
     assert names.shares({"low": -1.5, "high": -0.46}) == "\u2212150 to \u221246%"
+
+
+@pytest.mark.parametrize(
+    ("judged", "said"),
+    [
+        (
+            2,
+            "2 known effects were tried; none of them is needed to explain these data, and nothing else was left over.",
+        ),
+        (
+            1,
+            "1 known effect was tried; it is not needed to explain these data, and nothing else was left over.",
+        ),
+        (0, "No known effect could be tried; nothing was left over."),
+    ],
+)
+def test_how_many_effects_were_tried_is_a_sentence(judged: int, said: str) -> None:
+    rows = _report()["screening"]
+    report = {**_report(), "verdict": "NO_GAP", "causes": [], "screening": [*rows[:judged], rows[2]]}
+    meaning = tell(report).meaning
+    assert meaning.startswith(said)
+    assert ("1 more could not be judged" in meaning) == (judged > 0)
+    assert "could not be judged, because fitted parameters" in meaning
+
+
+@pytest.mark.parametrize(
+    ("resolves", "all_again", "more_decides"), [(True, 9.0, True), (True, None, False), (False, None, False)]
+)
+def test_more_data_are_not_said_to_decide_where_the_plan_says_that_they_do_not(
+    resolves: bool, all_again: float | None, more_decides: bool
+) -> None:
+    plan = {
+        "design": {"link": 3},
+        "repeats": 2,
+        "resolves": resolves,
+        "cost": 2.0,
+        "cost_of_all_again": all_again,
+    }
+    cause = {**_report()["causes"][0], "alias_class": []}
+    report = {**_report(), "verdict": "UNDETERMINED", "causes": [cause], "next_measurement": plan}
+    told = tell(report)
+    assert ("more data of the same kind would decide" in told.meaning) == more_decides
+    assert "First: no measurement" not in told.action
+    assert ("First: measure link 3" in told.action) == resolves
+    assert ("No measurement that is known of" in told.action) == (not resolves)
