@@ -1,18 +1,15 @@
 """A verdict in plain words: what was found, what it means for the twin, what to do."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import Any
 
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import UNSEEN, Cause, Detectable, Report, Site, is_quiet
+from dtprob.report.json_schema import UNSEEN, Cause, Detectable, Report, is_quiet
 from dtprob.report.names import (
     LEVEL,
     aliases,
-    block,
     capital,
-    detail,
     is_unchanged,
     listing,
     located_words,
@@ -26,10 +23,9 @@ from dtprob.report.names import (
     user_terms,
     words,
 )
+from dtprob.report.next_step import changed, decides, left_over, next_step, rivals
 from dtprob.report.units import DASH, percent
 
-_MUCH = 1.5
-"""Times as much that everything again costs from which that is told."""
 _NAMING = ("LISTED", "LISTED_WITH_REMAINDER")
 """Verdicts that name a cause."""
 
@@ -43,86 +39,6 @@ class Story:
     headline: str
     meaning: str
     action: str
-
-
-def rivals(report: Report) -> list[list[str]]:
-    """The sets of effects that compete for the first place: the first, its aliases, other likely ones."""
-    if not report["causes"]:
-        return []
-    first = report["causes"][0]
-    likely = [cause["effects"] for cause in report["causes"][1:] if cause["probability"] >= 0.05]
-    found: list[list[str]] = []
-    for effects in [first["effects"], *first["alias_class"], *likely]:
-        if sorted(effects) not in [sorted(other) for other in found]:
-            found.append(effects)
-    return found
-
-
-def next_step(report: Report) -> str | None:
-    """The next measurement in a sentence or two, or None where there is none.
-
-    Besides text it may be a mapping with a `description`, or with a `design` (coordinates), its `repeats`, and whether it
-    `resolves`.
-    """
-    plan = report["next_measurement"]
-    if not isinstance(plan, Mapping):
-        return plan
-    if "design" not in plan:
-        return plan.get("description")
-    where = {axis: value for axis, value in plan["design"].items() if axis != "design"}
-    place = listing(f"{words(axis)}{_places(value)}" for axis, value in where.items())
-    offered = plan["design"].get("design")
-    place = f"{place} of the design {words(offered)}" if offered else place
-    if not plan.get("resolves", True):
-        return f"No measurement that is known of tells the explanations apart, however often made; nearest: {place}."
-    times = plan.get("repeats", 1)
-    if plan.get("everything"):
-        return f"Measure everything again{f' {times} times' * (times > 1)}: no few places decide for less."
-    each = " each" * any(isinstance(value, list | tuple) and len(value) > 1 for value in where.values())
-    many = f" {times} times{each}" if times > 1 else ""
-    again = "" if offered else " again"
-    alone = [] in plan.get("split", [])
-    why = "there it would show most" if alone else "there the explanations differ most"
-    return f"Measure {place}{again}{many}: {why}.{_saved(plan)}"
-
-
-def _places(value: Any) -> str:
-    """` 3`, or `s 3 and 5`."""
-    if isinstance(value, list | tuple):
-        return f"{'s' * (len(value) > 1)} {listing(map(detail, value))}"
-    return f" {detail(value)}"
-
-
-def next_look(report: Report) -> str:
-    """Where to look for an unknown cause: the block of the data that shows it most, the quantity that must change."""
-    blocks, left = significant(report["where"]["coordinates"]), left_over(report)
-    where = (
-        f" at {block(max(blocks, key=lambda b: b['share'] or 0.0))}, where the gap shows most"
-        if blocks
-        else ""
-    )
-    there = " there" if where else ""
-    what = f" Look for what could {changed(left[:1])}{there}." if left else ""
-    if not where and not what:
-        return "No measurement is proposed."
-    return f"No measurement tells unknown causes apart. Look again{where or ' at the data'}.{what}"
-
-
-def changed(sites: Sequence[Site]) -> str:
-    """`change the path delays and cause the dependence of the delay on RSS`."""
-    verbs = ("cause" if (moment(site) or "").startswith("dependence") else "change" for site in sites)
-    return listing(f"{verb} the {located_words(site)}" for verb, site in zip(verbs, sites, strict=True))
-
-
-def _saved(plan: Mapping[str, Any]) -> str:
-    """How much less that costs than everything again, where that is much."""
-    if "cost_of_all_again" not in plan:
-        return ""
-    everything = plan["cost_of_all_again"]
-    if everything is None:
-        return " Measuring everything again would not decide."
-    times = everything / plan["cost"]
-    return f" Everything again would cost {times:.0f} times as much." if times >= _MUCH else ""
 
 
 def tell(report: Report) -> Story:
@@ -291,7 +207,7 @@ def _beyond(report: Report) -> str:
 def _undetermined(report: Report) -> Story:
     names = [together(effects) for effects in rivals(report)]
     step = next_step(report)
-    resolves, more = _decides(report["next_measurement"])
+    resolves, more = decides(report["next_measurement"])
     wait = f" {f'First: {step[:1].lower()}{step[1:]}' if resolves else step}" if step else ""
     if len(names) > 1:
         headline = f"There is a gap, but the data cannot tell {listing(names, 'from')}."
@@ -307,14 +223,6 @@ def _undetermined(report: Report) -> Story:
             f"{'; more data of the same kind would decide' * more}."
         )
     return Story("Cause undecided", "partly", headline, meaning, f"Do not change the twin yet.{wait}")
-
-
-def _decides(plan: Mapping[str, Any] | str | None) -> tuple[bool, bool]:
-    """Whether a proposed measurement decides, and whether more data of the same kind do, unless the plan denies it."""
-    if not isinstance(plan, Mapping):
-        return True, True
-    resolves = bool(plan.get("resolves", True))
-    return resolves, resolves and plan.get("cost_of_all_again", 0.0) is not None
 
 
 def _named(cause: Cause) -> str:
@@ -372,13 +280,6 @@ def _seat(report: Report) -> str:
     """` and lies in the path delays`, where the remainder or the gap was located."""
     left = left_over(report) or significant(report["where"]["sites"])[:1]
     return f" and lies in the {listing(located_words(site) for site in left[:2])}" if left else ""
-
-
-def left_over(report: Report) -> list[Site]:
-    """The sites at which something is left, each once, as it is most surely wrong."""
-    names, located = report["unlisted"]["sites"], report["unlisted"].get("located", [])
-    first = {site["site"]: site for site in reversed(located)}
-    return [first.get(name, {"site": name, "p_value": None, "share": None}) for name in names]
 
 
 _COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}

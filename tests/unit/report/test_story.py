@@ -7,8 +7,9 @@ from dtprob.report import names
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import UNSEEN, Cause, Detectable
+from dtprob.report.next_step import left_over, next_look, next_step
 from dtprob.report.page import bar, ranked
-from dtprob.report.story import advice, left_over, next_look, next_step, tell
+from dtprob.report.story import advice, tell
 
 
 def _cause(*effects: str, alias: list[list[str]] | None = None) -> Cause:
