@@ -74,10 +74,13 @@ class Programs:
 
     def _trials_of(self, effects: Sequence[Effect]) -> Hoisted:
         def trials(
-            values: Mapping[str, jax.Array], sizes: Mapping[str, jax.Array], arrays: Any
+            values: Mapping[str, jax.Array],
+            sizes: Mapping[str, jax.Array],
+            counts: Mapping[str, jax.Array],
+            arrays: Any,
         ) -> dict[str, dict[str, jax.Array]]:
             context = Context(eqx.combine(arrays, self._static), values)
-            return {e.name: trial_shifts(e, values, context, sizes[e.name]) for e in effects}
+            return {e.name: trial_shifts(e, values, context, sizes[e.name], counts[e.name]) for e in effects}
 
         return Hoisted(trials)
 
@@ -138,7 +141,8 @@ class Programs:
             for start in range(0, max((len(v) for v in wanted.values()), default=0), TRIALS):
                 portion = {n: v[start : start + TRIALS] for n, v in wanted.items() if len(v) > start}
                 filled = {n: self._filled(n, portion) for n in names}
-                shifts = self._trials[family](dict(values), filled, self._arrays)
+                counts = {n: np.asarray(len(portion.get(n, ()))) for n in names}
+                shifts = self._trials[family](dict(values), filled, counts, self._arrays)
                 for name, part in portion.items():
                     moved = {site: shift[: len(part)] for site, shift in shifts[name].items()}
                     yield name, slice(start, start + len(part)), moved

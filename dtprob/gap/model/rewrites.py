@@ -73,9 +73,9 @@ def place_scores(
 
 
 def trial_shifts(
-    effect: Effect, values: Mapping[str, jax.Array], context: Context, sizes: jax.Array
+    effect: Effect, values: Mapping[str, jax.Array], context: Context, sizes: jax.Array, count: jax.Array
 ) -> dict[str, jax.Array]:
-    """Rewritten sites less their values (trial, *site) at flat parameters (trial, n)."""
+    """Rewritten sites less their values (trial, *site) at the first of flat parameters (trial, n), zero at others."""
 
     def one(flat: jax.Array) -> dict[str, jax.Array]:
         parameters, result = unflatten(effect, flat), {}
@@ -84,7 +84,11 @@ def trial_shifts(
             result[site] = new - values[site]
         return result
 
-    return jax.vmap(one)(sizes)
+    def put(i: jax.Array, into: dict[str, jax.Array]) -> dict[str, jax.Array]:
+        return jax.tree.map(lambda all_, new: all_.at[i].set(new), into, one(sizes[i]))
+
+    nothing = {s: jnp.zeros((len(sizes), *values[s].shape), values[s].dtype) for s in effect.rewrites}
+    return jax.lax.fori_loop(0, count, put, nothing)
 
 
 def field_shifts(

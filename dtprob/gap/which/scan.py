@@ -9,7 +9,7 @@ while delays and gains stand where the wrong one put them.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -19,6 +19,7 @@ from jaxtyping import Bool
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.plausible import WHOLE, nulls, scales, sides, sizes
 from dtprob.gap.fitting.sweep import combined, elsewhere
+from dtprob.gap.model.compiled import CHUNK
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.directions import Surroundings, surroundings
 
@@ -36,6 +37,10 @@ _DRAWS = 64
 _STEPS = 21
 _WIDE = 128
 """Entries of a site up to which each is looked at for one that matters most."""
+
+
+type _Portion = tuple[str, slice, Mapping[str, jax.Array]]
+"""An effect, which of its trials, and the shifts of sites in each of them."""
 
 
 @dataclass(frozen=True)
@@ -183,9 +188,29 @@ def _terms(
     problem: Problem, around: Surroundings, sizes: Mapping[str, np.ndarray]
 ) -> Iterator[tuple[str, slice, np.ndarray]]:
     """What clusters add to the log posterior (trial, cluster) at some trials of an effect; what is not finite is -inf."""
-    for name, part, shifts in problem.programs.trial_shifts(around.grown(), sizes):
-        values = problem.compiled.shifted(around.x, shifts, part.stop - part.start)
-        yield name, part, np.nan_to_num(values, nan=-np.inf, posinf=-np.inf)
+    for portions in _packed(problem.programs.trial_shifts(around.grown(), sizes)):
+        starts = np.cumsum([0, *(part.stop - part.start for _, part, _ in portions)])
+        shifts: dict[str, np.ndarray] = {}
+        for start, (_, _, own) in zip(starts, portions, strict=False):
+            for site, shift in own.items():
+                into = shifts.setdefault(site, np.zeros((starts[-1], *shift.shape[1:]), shift.dtype))
+                into[start : start + len(shift)] = shift
+        values = problem.compiled.shifted(around.x, shifts, int(starts[-1]))
+        values = np.nan_to_num(values, nan=-np.inf, posinf=-np.inf)
+        for (name, part, _), terms in zip(portions, np.split(values, starts[1:-1]), strict=True):
+            yield name, part, terms
+
+
+def _packed(portions: Iterable[_Portion]) -> Iterator[list[_Portion]]:
+    """Trials of one effect after another together, as many as go through the model at a time."""
+    packed: list[_Portion] = []
+    for portion in portions:
+        if sum(part.stop - part.start for _, part, _ in [*packed, portion]) > CHUNK:
+            yield packed
+            packed = []
+        packed.append(portion)
+    if packed:
+        yield packed
 
 
 def _is_bent(change: np.ndarray, sided: Bool[np.ndarray, " line"]) -> bool:
