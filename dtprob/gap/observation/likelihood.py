@@ -35,6 +35,7 @@ class Likelihood:
         mean: expected value, where it is neither the location nor the distribution's own.
         log_prob: log density of each entry given those before it, where the entries of the last axis are one vector.
         density: log density of each value, where NumPyro's has no gradient at an end of what parameters may be.
+        impossible: which values cannot be although their density is finite.
     """
 
     make: Callable[..., Any]
@@ -52,3 +53,4 @@ class Likelihood:
     mean: Callable[[Parameters], jax.Array] | None = None
     log_prob: Rows | None = None
     density: Rows | None = None
+    impossible: Rows | None = None

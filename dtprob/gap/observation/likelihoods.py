@@ -207,6 +207,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.probs_shift,
         is_outcome=True,
         density=discrete.probs_density,
+        impossible=discrete.probs_impossible,
     ),
     "BinomialLogits": Likelihood(
         _binomial,
@@ -221,6 +222,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.probs_residual,
         discrete.probs_shift,
         density=discrete.probs_density,
+        impossible=discrete.probs_impossible,
     ),
     "CategoricalLogits": Likelihood(
         lambda logits: dist.Categorical(logits=logits), ("logits",), **_CLASSES, trailing={"logits": 1}

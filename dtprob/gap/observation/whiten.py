@@ -14,7 +14,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from dtprob.gap.observation.discrete import probs_impossible
 from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.observation.recognise import recognised
 from dtprob.gap.observation.residuals import Parameters
@@ -78,9 +77,9 @@ def log_prob(observed: Observation, value: jax.Array) -> jax.Array:
 
 def impossible(observed: Observation, value: jax.Array) -> jax.Array:
     """Which values that count cannot be, as a count where the rate is 0; shape of the value."""
-    found = ~(log_prob(observed, value) > -jnp.inf)
-    if observed.family in ("BernoulliProbs", "BinomialProbs"):
-        found |= probs_impossible(observed.parameters, value)
+    found, told = ~(log_prob(observed, value) > -jnp.inf), likelihood(observed.family).impossible
+    if told is not None:
+        found |= told(observed.parameters, value)
     return observed.masked(found) > 0
 
 

@@ -191,7 +191,7 @@ def _terms(
     for portions in _packed(problem.programs.trial_shifts(around.grown(), sizes)):
         starts = np.cumsum([0, *(part.stop - part.start for _, part, _ in portions)])
         shifts: dict[str, np.ndarray] = {}
-        for start, (_, _, own) in zip(starts, portions, strict=False):
+        for start, (_, _, own) in zip(starts[:-1], portions, strict=True):
             for site, shift in own.items():
                 into = shifts.setdefault(site, np.zeros((starts[-1], *shift.shape[1:]), shift.dtype))
                 into[start : start + len(shift)] = shift
