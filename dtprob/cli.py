@@ -12,7 +12,7 @@ from typing import Any, NoReturn
 from dtprob import __version__
 from dtprob.case import load_case
 from dtprob.commands.progress import unread
-from dtprob.errors import InputError, nearest
+from dtprob.errors import InputError, Terminated, nearest
 from dtprob.reproduce import FIGURES
 from dtprob.threads import one_thread
 from dtprob.xla import avoid_miscompilation
@@ -190,7 +190,7 @@ def _fail(status: int, text: str, *, debug: bool) -> int:
 
 def _terminate(number: int, frame: object) -> NoReturn:
     del number, frame
-    raise SystemExit(TERMINATED)
+    raise Terminated(TERMINATED)
 
 
 if __name__ == "__main__":

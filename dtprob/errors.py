@@ -32,6 +32,10 @@ class InputError(DtprobError):
         return type(self), (self.what, self.expected, self.got, self.remedy)
 
 
+class Terminated(SystemExit):
+    """The process was asked to end, unlike a user's module that leaves of its own accord."""
+
+
 def _sentence(text: str) -> str:
     return text if text.endswith((".", "?", "!")) else f"{text}."
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
-from dtprob.errors import InputError, unknown_name
+from dtprob.errors import InputError, Terminated, unknown_name
 
 
 def load_object(name: str, folder: Path) -> Any:
@@ -67,6 +67,8 @@ def _load_module(name: str, parts: list[str], folder: Path) -> ModuleType:
             raise InputError(f"module {name}", expected, "none of that name", "Check the name and the folder")
         try:
             return importlib.import_module(name)
+        except Terminated:
+            raise
         except (Exception, SystemExit) as error:
             got = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
             raise InputError(f"module {name}", "a module that runs", got, "Correct the module") from error

@@ -1,4 +1,4 @@
-"""Settings of the whole test suite: double precision, a sound compiler, fixed examples, and no silent skips on CI."""
+"""Settings of the whole test suite: double precision, a sound compiler whose programs are kept, fixed examples, no silent skips."""
 
 import gc
 import os
@@ -16,7 +16,20 @@ one_thread()
 
 import jax  # noqa: E402
 
+from dtprob.commands.cache import LARGEST, prune  # noqa: E402
+
+_COMPILED = Path(__file__).parents[1] / ".pytest_cache" / "compiled"
+
 jax.config.update("jax_enable_x64", True)
+# half of the suite's time is compiling, and many tests compile what another one has compiled
+jax.config.update("jax_compilation_cache_dir", str(_COMPILED))
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+
+
+def pytest_sessionstart(session: pytest.Session) -> None:
+    """Keep the programs of earlier runs within bounds; a worker beside others leaves this to the first process."""
+    if not hasattr(session.config, "workerinput"):
+        prune(_COMPILED, LARGEST)
 
 
 hypothesis.settings.register_profile("fixed", derandomize=True)
