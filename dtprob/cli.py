@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dtprob import __version__
-from dtprob.case import load_case
+from dtprob.case import load_case, read_document
 from dtprob.commands.progress import unread
 from dtprob.errors import InputError, Terminated, nearest
 from dtprob.reproduce import FIGURES
@@ -167,6 +167,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if "case" in options:  # before anything heavy, so that a mistake in it shows at once
             options["case"] = load_case(options["case"])
+        if "twin_case" in options:
+            read_document(options["twin_case"])
         getattr(importlib.import_module(COMMANDS[command]), step)(**options)
     except KeyboardInterrupt:
         resume = " Continue with the same command and --resume." if "resume" in options else ""

@@ -1,4 +1,4 @@
-"""Settings of the whole test suite: double precision, a sound compiler whose programs are kept, fixed examples, no silent skips."""
+"""Settings of the whole test suite: double precision, a sound compiler, kept programs, fixed examples, no silent skips."""
 
 import gc
 import os

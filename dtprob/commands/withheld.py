@@ -95,11 +95,12 @@ def run(
         InputError: no cases, a number of workers below 1, a seed below 0, or answers that are no folder.
         RuntimeError: some cases could not be diagnosed; why lies in OUT/NAME/error.txt.
     """
+    if workers < 1:
+        raise InputError("--workers", "a number from 1", str(workers), "Correct it")
     found = sorted(path.parent.name for path in cases.glob("*/case.toml"))
-    if not found or workers < 1:
-        got = f"{len(found)} cases, {workers} workers"
+    if not found:
         raise InputError(
-            f"{cases}", "folders with a case.toml each, and a worker or more", got, "Correct them"
+            f"{cases}", "folders with a case.toml each", "none", "Name the folder that holds the cases"
         )
     if seed is not None:
         check_seed(seed)

@@ -210,7 +210,8 @@ def _undetermined(report: Report) -> Story:
     resolves, more = decides(report["next_measurement"])
     wait = f" {f'First: {step[:1].lower()}{step[1:]}' if resolves else step}" if step else ""
     if len(names) > 1:
-        headline = f"There is a gap, but the data cannot tell {listing(names, 'from')}."
+        told = listing(names, "from") if len(names) == 2 else f"apart {listing(names)}"
+        headline = f"There is a gap, but the data cannot tell {told}."
         meaning = "The gap is real, and none of these explanations can be ruled out. Choosing one now would be a guess."
     else:
         signs = f"signs of {names[0]}" if names else "signs of a gap"

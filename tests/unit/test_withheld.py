@@ -147,11 +147,14 @@ def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeyp
     ("words", "text"),
     [
         (["run", "nowhere", "--out", "out"], "folders with a case.toml each"),
-        (["run", ".", "--out", "out", "--workers", "0"], "a worker or more"),
+        (["run", ".", "--out", "out", "--workers", "0"], "--workers: expected a number from 1"),
         (["score", ".", "--key", "key.json"], "No such file"),
         (["score", ".", "--key", "list.json"], "expected a JSON object, got list"),
         (["generate", "--track", "chanel", "--count", "1", "--out", "out"], "Did you mean 'channel'?"),
-        (["generate", "--track", "channel", "--count", "0", "--out", "out"], "--count: expected a number from 1"),
+        (
+            ["generate", "--track", "channel", "--count", "0", "--out", "out"],
+            "--count: expected a number from 1",
+        ),
         (["genrate"], "Did you mean 'generate'?"),
     ],
 )

@@ -375,3 +375,19 @@ def test_more_data_are_not_said_to_decide_where_the_plan_says_that_they_do_not(
     assert "First: no measurement" not in told.action
     assert ("First: measure link 3" in told.action) == resolves
     assert ("No measurement that is known of" in told.action) == (not resolves)
+
+
+@pytest.mark.parametrize(
+    ("others", "told"),
+    [
+        ([["mutual_coupling"]], "cannot tell clipping from mutual coupling."),
+        (
+            [["mutual_coupling"], ["phase_noise"]],
+            "cannot tell apart clipping, mutual coupling and phase noise.",
+        ),
+    ],
+)
+def test_what_cannot_be_told_apart_is_listed(others: list[list[str]], told: str) -> None:
+    cause = {**_report()["causes"][0], "effects": ["clipping"], "alias_class": others}
+    report = {**_report(), "verdict": "UNDETERMINED", "causes": [cause], "next_measurement": None}
+    assert tell(report).headline == f"There is a gap, but the data {told}"
