@@ -13,7 +13,7 @@ from dtprob.gap.model.problem import Problem
 from tests.unit.gap.examples import draw, line
 
 RAISED = Effect("raised", {"mean": lambda v, p, c: v + p["by"]}, (Parameter("by", dist.Normal(0.0, 2.0)),))
-COUNT = 60
+COUNT = 30
 """Data sets."""
 
 
@@ -47,7 +47,7 @@ def test_it_is_nothing_on_average_and_as_uncertain_as_it_says(spread):
 
 @pytest.mark.parametrize("spread", [0.05, 1.0])
 def test_an_effect_that_does_what_a_known_parameter_does_closes_no_gap_by_chance(spread):
-    """At most 1 in 20 establish one; of 60 more than 9 would with probability 1e-3."""
+    """At most 1 in 20 establish one; of 30 more than 6 would with probability 6e-4."""
     established = 0
     for problem, fitted in drawn(spread):
         wide = problem.with_live(["raised"])
@@ -56,7 +56,7 @@ def test_an_effect_that_does_what_a_known_parameter_does_closes_no_gap_by_chance
         before, after = closed.cross_fit(problem, fitted, folds), closed.cross_fit(wide, full, folds)
         floor = closed.floor(wide, full, after, 0.0, 5)
         established += closed.closed_fraction(before, after, floor, jax.random.key(0)) is not None
-    assert established <= 9
+    assert established <= 6
 
 
 def test_without_a_reference_it_is_nothing():
