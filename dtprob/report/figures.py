@@ -4,6 +4,7 @@ Each function returns a `matplotlib.figure.Figure` of its own, drawn without pyp
 global settings. They are 5 inches wide, so that their letters stay legible on a telephone.
 """
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,8 @@ from dtprob.report.palette import LIGHT, RAMP
 from dtprob.report.units import decimals_for, number
 
 WIDTH = 5.0
+_LETTERS = 54
+"""Of a row's name that have room in a line."""
 STYLE: dict[Any, Any] = {
     "font.size": 11,
     "font.family": "DejaVu Sans",
@@ -201,12 +204,22 @@ def _beside(axes: Axes, x: float, y: float, text: str) -> None:
 
 
 def _rows(names: Sequence[str], height: float) -> tuple[Figure, Axes]:
-    """Axes with a row for each name, whose name stands at the left above the row's place."""
+    """Axes with a row for each name, whose name stands at the left above the row's place, in lines if it is long."""
+    lines = [textwrap.wrap(name, _LETTERS) for name in names]
+    height += 0.18 * (max(map(len, lines), default=1) - 1)
     figure, axes = plain_figure(0.65 + height * len(names))
-    for place, name in enumerate(names):
-        axes.annotate(
-            name, (0, place), (0, 9.5), ("axes fraction", "data"), "offset points", va="baseline", size=10.5
-        )
+    for place, parts in enumerate(lines):
+        for above, text in enumerate(reversed(parts)):
+            written = axes.annotate(
+                text,
+                (0, place),
+                (0, 9.5 + 12.5 * above),
+                ("axes fraction", "data"),
+                "offset points",
+                va="baseline",
+                size=10.5,
+            )
+            written.set_in_layout(False)  # else the axes shrink until the name has room beside them
     axes.set_ylim(len(names) - 0.55, -0.75)
     axes.yaxis.set_visible(False)
     axes.spines["left"].set_visible(False)
