@@ -199,7 +199,7 @@ def user_terms(name: str, before: float | None, after: float | None) -> list[str
     shown = [scale(value) for value in values]
     decimals = 1 if unit == "dB" else decimals_between(shown[0], shown[-1])
     if decimals is not None and shown[0]:
-        decimals = min(decimals, max(_DIGITS - 1 - math.floor(math.log10(abs(shown[0]))), 0))
+        decimals = min(decimals, _DIGITS - 1 - math.floor(math.log10(abs(shown[0]))))
     return [with_unit(number(value, decimals), scale.unit) for value in shown]
 
 
