@@ -122,6 +122,15 @@ def test_classes_cover_the_values() -> None:
     assert len(classes_for(np.zeros(4)).colours) >= 1
 
 
+@pytest.mark.parametrize("others", [np.random.default_rng(0).normal(size=100), np.zeros(100)])
+def test_one_bad_link_of_a_hundred_has_a_class_of_its_own(others: np.ndarray) -> None:
+    """It looked like the worst of those that fit, since the classes ended there."""
+    classes = classes_for(np.append(others, 60.0))
+    rank = classes(np.append(others, 60.0))
+    assert np.max(rank[:-1]) < rank[-1]
+    assert classes.edges[1] - classes.edges[0] > 1e-3
+
+
 @pytest.mark.parametrize("theme", [LIGHT, DARK])
 def test_text_has_contrast(theme: dict[str, str]) -> None:
     for name in ("ink", "muted", "accent", "good", "found", "partly", "unknown", "before", "after"):
