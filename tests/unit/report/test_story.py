@@ -2,6 +2,7 @@
 
 import pytest
 
+from dtprob.effects import summaries
 from dtprob.gap.fitting import soundness
 from dtprob.report import names
 from dtprob.report.advice import ADVICE, family
@@ -282,6 +283,7 @@ def test_advice_reads_as_an_imperative() -> None:
     assert family("blockage[wall_3]") == "blockage"
     assert advice("blockage[wall_3]") == ADVICE["blockage"]
     assert "new_effect" not in ADVICE
+    assert set(ADVICE) == set(summaries())
     assert advice("new_effect[2]") == "add new effect (2), with its estimated size, to the twin"
     for text in ADVICE.values():
         assert text[0].islower()
