@@ -67,7 +67,7 @@ def words(name: str) -> str:
     """A code name as words: ``iq_imbalance`` is "I/Q imbalance", ``gain[rx_2]`` is "gain (rx 2)"."""
     stem, _, instance = name.partition("[")
     text = " ".join(_CAPITALS.get(word, word) for word in stem.split("_"))
-    return f"{text} ({instance.rstrip(']').replace('_', ' ')})" if instance else text
+    return f"{text} ({instance.removesuffix(']').replace('_', ' ')})" if instance else text
 
 
 def site_words(site: str) -> str:

@@ -44,6 +44,16 @@ def test_lines_and_shares(paths: xr.Dataset) -> None:
     assert after.objects[0][3] == pytest.approx(1 / 15)
 
 
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_path_without_a_number_is_left_out(paths: xr.Dataset, value: float) -> None:
+    """It cost the whole report."""
+    paths["before"][0, 0] = value
+    report: Any = {"gap": {"after": 0.5}}
+    before, after = scene_charts(report, xr.DataTree.from_dict({"paths": paths}))
+    assert all("3 paths; share of the excess on paths by way of wall 2" in one.svg for one in (before, after))
+    assert "by way of wall 2 100%" in before.svg
+
+
 def test_paths_that_meet_nothing_are_told_without_objects(paths: xr.Dataset) -> None:
     report: Any = {"gap": {"after": None}}
     (chart,) = scene_charts(report, xr.DataTree.from_dict({"paths": paths.isel(path=[0])}))

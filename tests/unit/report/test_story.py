@@ -31,6 +31,7 @@ def test_only_what_is_hardly_chance_is_located() -> None:
 def test_names_become_words() -> None:
     assert names.words("iq_imbalance") == "I/Q imbalance"
     assert names.words("object_displacement[building_2]") == "object displacement (building 2)"
+    assert names.words("bias[rack[3]]") == "bias (rack[3])"
     assert names.together(["a_b", "c", "ack_loss"]) == "a b, c and ACK loss"
     assert names.listing([]) == ""
     assert names.site_words("arrival") == "directions of arrival"
