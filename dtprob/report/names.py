@@ -8,6 +8,7 @@ from typing import Any, Final
 from dtprob.report.json_schema import Cause, Coordinates, Interval, Remainder, Site, Size
 from dtprob.report.units import (
     Reading,
+    Scale,
     decimals_between,
     number,
     percent,
@@ -192,10 +193,13 @@ def _stem_and_unit(name: str) -> tuple[str, str]:
 
 
 def user_terms(name: str, before: float | None, after: float | None) -> list[str]:
-    """Numbers in the user's own terms before and after (where there is an after), in one unit."""
+    """Numbers in the user's own terms before and after (where there is an after), in one unit.
+
+    An error of a power in W stays one: in dBm it would be read as a level, or as an error in dB.
+    """
     values = [before] if after is None else [before, after]
-    unit = _stem_and_unit(name)[1]
-    scale = scale_for(values, unit)
+    stem, unit = _stem_and_unit(name)
+    scale = Scale(1.0, unit) if unit == "W" and stem.endswith("_rmse") else scale_for(values, unit)
     shown = [scale(value) for value in values]
     decimals = 1 if unit == "dB" else decimals_between(shown[0], shown[-1])
     if decimals is not None and shown[0]:

@@ -169,7 +169,8 @@ def test_absent_parts_leave_a_page(examples: dict[str, Any]) -> None:
         report["where"] = {"sites": [], "coordinates": []}
         for cause in report["causes"]:
             cause |= {"closed_fraction": None, "size": {}}
-        Page(render(report, xr.DataTree.from_dict({"/where": xr.Dataset()}), title="x"))
+        page = Page(render(report, xr.DataTree.from_dict({"/where": xr.Dataset()}), title="x"))
+        assert "Written by dtprob. " in " ".join(page.words)
 
 
 def test_long_tables_are_folded_but_complete(examples: dict[str, Any]) -> None:

@@ -63,6 +63,8 @@ def test_user_terms_share_unit_and_decimals() -> None:
     assert names.user_terms("label_rmse", 0.5, None) == ["0.500"]
     assert names.user_terms("channel_nmse_db", -3.14, -17.8) == ["−3.1\u202fdB", "−17.8\u202fdB"]
     assert names.user_terms("delay_s", 1e-9, None) == ["1.00\u202fns"]
+    assert names.user_terms("power_w", 1e-3, None) == ["0\u202fdBm"]
+    assert names.user_terms("power_w_rmse", 0.308, 0.2) == ["0.31\u202fW", "0.20\u202fW"]
     assert names.user_terms("throughput_error", 0.127013, 0.1270131) == ["0.1270", "0.1270"]
     assert names.is_unchanged("throughput_error", 0.127, 0.1275)
     assert not names.is_unchanged("throughput_error", 0.236, 0.219)
