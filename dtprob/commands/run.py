@@ -101,6 +101,8 @@ def infer(
     resume = run.resume and checkpoint.is_file() and _read(begun) == own
     if run.resume and checkpoint.is_file() and not resume:
         run.say("what the case is made of has changed since the checkpoint: beginning anew")
+    if not resume:
+        checkpoint.unlink(missing_ok=True)  # else it would pass for one of the run that is begun now
     write_text(begun, own)
     options = replace(
         LATENTS_ONLY if latents_only else RunOptions(),

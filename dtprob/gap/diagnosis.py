@@ -11,6 +11,7 @@ import xarray as xr
 
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.how_far.shares import Share
+from dtprob.inference.storage import renamed, without_slashes
 
 
 @dataclass(frozen=True)
@@ -75,8 +76,12 @@ class Diagnosis:
         return plain(report)
 
     def to_datatree(self) -> xr.DataTree:
-        """The content of gap.nc: groups where, differences, links or clusters, screening, paths."""
-        return xr.DataTree.from_dict({f"/{name}": dataset for name, dataset in self.maps.items()})
+        """The content of gap.nc: groups where, differences, links or clusters, screening, paths.
+
+        A slash in a name, as of plates within `numpyro.handlers.scope`, is a dot there.
+        """
+        names = without_slashes(self.maps.values())
+        return xr.DataTree.from_dict({f"/{name}": renamed(each, names) for name, each in self.maps.items()})
 
 
 def _cause(cause: Cause) -> dict[str, Any]:

@@ -36,8 +36,8 @@ def to_datatree(posterior: Posterior) -> xr.DataTree:
         "extra": _dataset(posterior.extra, {}, (), {}),
     }
     filled = {name: dataset for name, dataset in groups.items() if name == "posterior" or dataset.data_vars}
-    written = _without_slashes(filled.values())
-    tree = xr.DataTree.from_dict({name: _renamed(dataset, written) for name, dataset in filled.items()})
+    written = without_slashes(filled.values())
+    tree = xr.DataTree.from_dict({name: renamed(dataset, written) for name, dataset in filled.items()})
     tree.attrs = {
         "format": FORMAT,
         "provenance": json.dumps(posterior.provenance, sort_keys=True),
@@ -84,7 +84,7 @@ def from_datatree(tree: xr.DataTree, what: str = "data tree") -> Posterior:
         remedy = "Read it with the version of dtprob that wrote it, or with arviz"
         raise InputError(what, f"format '{FORMAT}'", repr(found), remedy)
     names = json.loads(tree.attrs.get("names", "{}"))
-    groups = {group: _renamed(child.to_dataset(), names) for group, child in tree.children.items()}
+    groups = {group: renamed(child.to_dataset(), names) for group, child in tree.children.items()}
     arrays = {group: _arrays(dataset) for group, dataset in groups.items()}
     coords = {
         str(name): value.values
@@ -106,7 +106,7 @@ def from_datatree(tree: xr.DataTree, what: str = "data tree") -> Posterior:
     )
 
 
-def _without_slashes(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
+def without_slashes(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
     """How names with slashes, as of sites within `numpyro.handlers.scope`, are written: a tree cannot hold them."""
     names = {str(name) for dataset in datasets for name in (*dataset.variables, *dataset.dims)}
     written: dict[str, str] = {}
@@ -119,7 +119,8 @@ def _without_slashes(datasets: Iterable[xr.Dataset]) -> dict[str, str]:
     return written
 
 
-def _renamed(dataset: xr.Dataset, names: Mapping[str, str]) -> xr.Dataset:
+def renamed(dataset: xr.Dataset, names: Mapping[str, str]) -> xr.Dataset:
+    """The dataset with those of its variables and axes renamed that have another name in `names`."""
     return dataset.rename({o: n for o, n in names.items() if o in dataset.variables or o in dataset.dims})
 
 

@@ -76,13 +76,10 @@ ADVICE: Mapping[str, str] = {
     "interferer": "add an interferer that blocks reception in some slots",
     "ack_loss": "let acknowledgements be lost with the estimated probability",
     "drift": "let the parameter change over time instead of staying fixed",
-    "larger_buffer": "set the buffer capacity to the estimate",
-    "action_delay": "delay the effect of actions by the estimated number of slots",
     "duty_cycle": "limit the device to its duty cycle",
     # labels
     "regional_bias": "correct the predictions in the region concerned",
     "scale_bias": "scale and shift the predictions by the estimates",
-    "covariate_shift": "weight the labelled points as the unlabelled ones are distributed",
     "label_noise": "raise the noise of the labels to the estimate",
     "stale_map": "replace the map behind the predictions by a current one",
 }

@@ -21,8 +21,8 @@ _GROUPS = 24
 def coordinate_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     """A map of the gap over each axis that gap.nc holds, those that the report names first."""
     data = group(gap, "where", report)
-    named = [axis for entry in report["where"]["coordinates"] for axis in entry["axes"]]
-    axes = [name[len(_BEFORE) :] for name in map(str, data) if _is_before(name) and data[name].count() > 1]
+    named = [axis.replace("/", ".") for entry in report["where"]["coordinates"] for axis in entry["axes"]]
+    axes = [axis for axis in _axes(data, _BEFORE) if data[_BEFORE + axis].count() > 1]
     ordered = sorted(axes, key=lambda axis: named.index(axis) if axis in named else len(named))
     quiet = is_quiet(report)
     return [_coordinate_chart(data, axis, quiet=quiet, named=axis in named) for axis in ordered[:_MOST_MAPS]]
@@ -109,8 +109,10 @@ def _peak(values: np.ndarray, place: np.ndarray, name: str) -> str:
     return f"{name}, the highest excess is {number(float(values[top]))} standard deviations at {where}"
 
 
-def _is_before(name: str) -> bool:
-    return name.startswith(_BEFORE) and not name.startswith(_AFTER)
+def _axes(data: xr.Dataset, prefix: str) -> list[str]:
+    """The axes along which there is a variable that is called after its axis, with a prefix."""
+    ends = ((str(name), str(one.dims[0])) for name, one in data.data_vars.items())
+    return [axis for name, axis in ends if name == prefix + axis]
 
 
 def closed_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
@@ -118,9 +120,7 @@ def closed_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     data = group(gap, "where", report)
     if not report["causes"]:
         return []
-    axes = [
-        name[len(_EXPECTED) :] for name in map(str, data) if name.startswith(_EXPECTED) and data[name].count()
-    ]
+    axes = [axis for axis in _axes(data, _EXPECTED) if data[_EXPECTED + axis].count()]
     uneven = {axis: float(data[_EXPECTED + axis].max()) * data.sizes[axis] for axis in axes}
     return [_closed_chart(data, axis) for axis in sorted(axes, key=lambda a: -uneven[a])[:_MOST_SHARES]]
 

@@ -23,5 +23,10 @@ def group(gap: xr.DataTree | None, name: str, report: Report) -> xr.Dataset:
         return xr.Dataset()
     dataset = gap[name].to_dataset()
     accepted = report["gap"]["after"] is not None
-    kept = [key for key in map(str, dataset.data_vars) if accepted or "after" not in key.split("_")]
+    kept = [str(key) for key, one in dataset.data_vars.items() if accepted or not _is_after(str(key), one)]
     return dataset[kept].where(np.abs(dataset[kept]) < np.inf)
+
+
+def _is_after(name: str, values: xr.DataArray) -> bool:
+    """Whether a variable is of the twin with the cause added; of a map, whose axis may be called "after ..." itself."""
+    return name.startswith("after") or name == f"gap_after_{values.dims[0]}"

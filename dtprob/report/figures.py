@@ -4,6 +4,7 @@ Each function returns a `matplotlib.figure.Figure` of its own, drawn without pyp
 global settings. They are 5 inches wide, so that their letters stay legible on a telephone.
 """
 
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +21,8 @@ from dtprob.report.palette import LIGHT, RAMP
 from dtprob.report.units import decimals_for, number
 
 WIDTH = 5.0
+_LETTERS = 54
+"""Of a row's name that have room in a line."""
 STYLE: dict[Any, Any] = {
     "font.size": 11,
     "font.family": "DejaVu Sans",
@@ -56,7 +59,10 @@ class IntervalRow:
 
 @dataclass(frozen=True)
 class Classes:
-    """The classes of a coloured quantity: colour i lies between edges i and i + 1, and the ends are open."""
+    """The classes of a coloured quantity: colour i lies between edges i and i + 1, and the ends are open.
+
+    The last edge may be infinite.
+    """
 
     edges: Float[np.ndarray, " edge"]
 
@@ -74,11 +80,23 @@ class Classes:
 
 
 def classes_for(*values: ArrayLike) -> Classes:
-    """Up to six classes with round edges that cover all values but the most extreme two percent."""
+    """Up to six classes with round edges that cover all values but the most extreme two percent at either end.
+
+    What lies far above them has the last class, which has no upper edge, for itself.
+    """
     together = np.concatenate([np.ravel(np.asarray(value, dtype=float)) for value in values])
     low, high = min(0.0, float(np.quantile(together, 0.02))), float(np.quantile(together, 0.98))
-    edges = MaxNLocator(nbins=len(RAMP), steps=[1, 2, 2.5, 5, 10]).tick_values(low, max(high, low + 1e-9))
-    return Classes(np.asarray(edges[: len(RAMP) + 1], dtype=float))
+    most = float(together.max())
+    high = max(high if high > low else most, low + 1e-9)
+    few = _edges(low, high, len(RAMP) - 2)
+    beyond = 2 * few[-1] - few[-2]
+    return Classes(np.append(few, [beyond, np.inf]) if most > beyond else _edges(low, high, len(RAMP)))
+
+
+def _edges(low: float, high: float, count: int) -> Float[np.ndarray, " edge"]:
+    """Round edges of at most so many classes."""
+    edges = MaxNLocator(nbins=count, steps=[1, 2, 2.5, 5, 10]).tick_values(low, high)
+    return np.asarray(edges[: count + 1], dtype=float)
 
 
 def interval_plot(
@@ -201,12 +219,22 @@ def _beside(axes: Axes, x: float, y: float, text: str) -> None:
 
 
 def _rows(names: Sequence[str], height: float) -> tuple[Figure, Axes]:
-    """Axes with a row for each name, whose name stands at the left above the row's place."""
+    """Axes with a row for each name, whose name stands at the left above the row's place, in lines if it is long."""
+    lines = [textwrap.wrap(name, _LETTERS) for name in names]
+    height += 0.18 * (max(map(len, lines), default=1) - 1)
     figure, axes = plain_figure(0.65 + height * len(names))
-    for place, name in enumerate(names):
-        axes.annotate(
-            name, (0, place), (0, 9.5), ("axes fraction", "data"), "offset points", va="baseline", size=10.5
-        )
+    for place, parts in enumerate(lines):
+        for above, text in enumerate(reversed(parts)):
+            written = axes.annotate(
+                text,
+                (0, place),
+                (0, 9.5 + 12.5 * above),
+                ("axes fraction", "data"),
+                "offset points",
+                va="baseline",
+                size=10.5,
+            )
+            written.set_in_layout(False)  # else the axes shrink until the name has room beside them
     axes.set_ylim(len(names) - 0.55, -0.75)
     axes.yaxis.set_visible(False)
     axes.spines["left"].set_visible(False)
@@ -221,7 +249,8 @@ def legend_bar(axes: Axes, classes: Classes, label: str) -> None:
         bar.axvspan(index, index + 1, facecolor=colour, edgecolor=LIGHT["muted"], linewidth=0.5)
     bar.set_xlim(0, count)
     bar.set_yticks([])
-    bar.set_xticks(range(count + 1), [f"{edge:.4g}" for edge in classes.edges], size=10)
+    edges = [f"{edge:.4g}" if np.isfinite(edge) else "" for edge in classes.edges]
+    bar.set_xticks(range(count + 1), edges, size=10)
     bar.tick_params(axis="x", length=0, pad=2)
     for spine in bar.spines.values():
         spine.set_visible(False)

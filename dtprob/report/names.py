@@ -8,6 +8,7 @@ from typing import Any, Final
 from dtprob.report.json_schema import Cause, Coordinates, Interval, Remainder, Site, Size
 from dtprob.report.units import (
     Reading,
+    Scale,
     decimals_between,
     number,
     percent,
@@ -67,7 +68,7 @@ def words(name: str) -> str:
     """A code name as words: ``iq_imbalance`` is "I/Q imbalance", ``gain[rx_2]`` is "gain (rx 2)"."""
     stem, _, instance = name.partition("[")
     text = " ".join(_CAPITALS.get(word, word) for word in stem.split("_"))
-    return f"{text} ({instance.rstrip(']').replace('_', ' ')})" if instance else text
+    return f"{text} ({instance.removesuffix(']').replace('_', ' ')})" if instance else text
 
 
 def site_words(site: str) -> str:
@@ -192,14 +193,17 @@ def _stem_and_unit(name: str) -> tuple[str, str]:
 
 
 def user_terms(name: str, before: float | None, after: float | None) -> list[str]:
-    """Numbers in the user's own terms before and after (where there is an after), in one unit."""
+    """Numbers in the user's own terms before and after (where there is an after), in one unit.
+
+    An error of a power in W stays one: in dBm it would be read as a level, or as an error in dB.
+    """
     values = [before] if after is None else [before, after]
-    unit = _stem_and_unit(name)[1]
-    scale = scale_for(values, unit)
+    stem, unit = _stem_and_unit(name)
+    scale = Scale(1.0, unit) if unit == "W" and stem.endswith("_rmse") else scale_for(values, unit)
     shown = [scale(value) for value in values]
     decimals = 1 if unit == "dB" else decimals_between(shown[0], shown[-1])
     if decimals is not None and shown[0]:
-        decimals = min(decimals, max(_DIGITS - 1 - math.floor(math.log10(abs(shown[0]))), 0))
+        decimals = min(decimals, _DIGITS - 1 - math.floor(math.log10(abs(shown[0]))))
     return [with_unit(number(value, decimals), scale.unit) for value in shown]
 
 

@@ -44,6 +44,7 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
     """
     checked = validate(report)
     charts = list(all_charts(checked, gap))
+    candidates = ranked(checked.get("screening", []))
     return (
         environment()
         .get_template("page.html.jinja")
@@ -58,7 +59,8 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
             left_over=left_over(checked),
             next_look=next_look(checked),
             charts={section: [chart for name, chart in charts if name == section] for section, _ in charts},
-            candidates=ranked(checked.get("screening", [])),
+            candidates=candidates,
+            judged=sum(not candidate.get("absorbed_by") for candidate in candidates),
             detectable=detectable_families(checked["detectable"]),
             light=LIGHT,
             dark=DARK,

@@ -41,12 +41,15 @@ class Scene:
 def scene(paths: xr.Dataset, when: str) -> Scene:
     """The scene of the group `paths` of gap.nc; shares are of what all paths carry before the cause is added.
 
+    Paths whose excess is not finite are left out.
+
     Args:
         paths: the group.
         when: "before" or "after" the cause.
     """
-    kept = np.argwhere(paths["mask"].values)
     excess = paths[when].values
+    exists = paths["mask"].values & np.isfinite(excess) & np.isfinite(paths["before"].values)
+    kept = np.argwhere(exists)
     steps, vertex, owner = (paths[name].values for name in ("interaction", "vertex", "object"))
     start, end = paths["tx_position"].values, paths["rx_position"].values
     lines = [
@@ -55,7 +58,6 @@ def scene(paths: xr.Dataset, when: str) -> Scene:
         )
         for link, path in kept
     ]
-    exists = paths["mask"].values
     carried = np.where(exists, np.maximum(excess, 0.0), 0.0)
     total = max(float(np.maximum(paths["before"].values[exists], 0.0).sum()), 1e-300)
     met = (steps > 0) & exists[..., None]

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import re
+import warnings
 from xml.etree import ElementTree as ET
 
 import matplotlib as mpl
@@ -15,6 +16,8 @@ from dtprob.report.palette import LIGHT
 
 _VARIABLES = {colour: f"var(--{name})" for name, colour in LIGHT.items()}
 _FONT_FAMILY = re.compile(r"font-family: [^;]*;?\s*")
+_NO_TEXT = re.compile(r"[\x00-\x08\x0b\x0c\x0e-\x1f]")
+"""Signs that XML has no place for; a name of the user's may hold one."""
 _REFERENCE = re.compile(r"#([\w-]+)")
 
 
@@ -30,9 +33,10 @@ def inline_svg(figure: Figure, alt: str) -> Markup:
         and ids do not clash with those of other figures.
     """
     buffer = io.StringIO()
-    with mpl.rc_context(STYLE):
+    with mpl.rc_context(STYLE), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "Glyph .* missing from font")  # a page has fonts of its own
         FigureCanvasSVG(figure).print_svg(buffer, metadata={"Date": None})
-    text = buffer.getvalue()
+    text, alt = (_NO_TEXT.sub("\ufffd", one) for one in (buffer.getvalue(), alt))
     root = ET.fromstring(text)  # noqa: S314  (written two lines above)
     mark = hashlib.sha256((text + alt).encode()).hexdigest()[:8]
     _clean(root, _referenced(root), mark)

@@ -9,6 +9,8 @@ from typing import overload
 DASH = "–"
 """Stands for a number that is not determined."""
 
+_DECIMALS, _MOST_PLACES = 6, 15
+"""The most decimals that are shown, and the most before a power of ten, which is all that a number holds."""
 _NARROW = "\u202f"
 _MINUS = "\u2212"
 _SUPERSCRIPT = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")
@@ -101,19 +103,24 @@ def scale_for(numbers: Sequence[float | None], unit: str) -> Scale:
 
 
 def number(value: float | None, decimals: int | None = None, digits: int = 3) -> str:
-    """A number with a true minus and `decimals`, or else `digits`; a power of ten where that is shorter."""
+    """A number with a true minus and `decimals`, or else `digits`; a power of ten where that is shorter.
+
+    Decimals below 0 stand for tens, hundreds and so on.
+    """
     if value is None:
         return DASH
     if value == 0:
         return "0"
     if not 1e-4 <= abs(value) < 1e6:
-        mantissa, exponent = f"{value:.1e}".split("e")
+        size = math.floor(math.log10(abs(value)))
+        places = 1 if decimals is None else min(max(decimals + size, 1), _MOST_PLACES)
+        mantissa, exponent = f"{value:.{places}e}".split("e")
         return f"{mantissa}{_NARROW}×{_NARROW}10{str(int(exponent)).translate(_SUPERSCRIPT)}".replace(
             "-", _MINUS
         )
     if decimals is None:
         decimals = max(0, digits - 1 - int(f"{value:.{digits - 1}e}".partition("e")[2]))
-    text = f"{value:.{decimals}f}"
+    text = f"{value:.{min(max(decimals, 0), _DECIMALS)}f}"
     if re.fullmatch(r"-0\.?0*", text):
         text = text[1:]
     return text.replace("-", _MINUS)
@@ -139,8 +146,8 @@ def reading(mean: float | None, low: float | None, high: float | None, unit: str
 
 
 def decimals_for(width: float) -> int | None:
-    """The decimals that show two digits of an interval's width; None where the interval is a point."""
-    return min(6, max(0, 1 - math.floor(math.log10(width)))) if width > 0 else None
+    """The decimals that show two digits of an interval's width, see `number`; None where the interval is a point."""
+    return 1 - math.floor(math.log10(width)) if width > 0 else None
 
 
 def decimals_between(low: float | None, high: float | None) -> int | None:

@@ -3,10 +3,10 @@
 import dataclasses
 import hashlib
 import json
-import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree as ET
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -25,8 +25,6 @@ from dtprob.raytracing.beyond import strongest, with_beyond
 from dtprob.raytracing.paths import PathSet
 
 _WALL_THICKNESS = 0.12
-_MESH = re.compile(r"""name\s*=\s*["']filename["']\s+value\s*=\s*["']([^"']+)["']""")
-"""How a scene names the file of a mesh or a picture."""
 _APART = 1e-2
 """Ends closer than this, in m, cannot be traced."""
 _MOST_BEYOND = 64
@@ -211,12 +209,28 @@ def _scene_hash(scene: SceneSection, data: ChannelData | PowerData) -> str:
 
 
 def scene_files(scene: SceneSection) -> list[Path]:
-    """The files that a scene is made of: its own, and the meshes that a Mitsuba XML names; none of a shipped one."""
+    """The files that a scene is made of: its own, and what a Mitsuba XML names or includes; none of a shipped one."""
     file = Path(scene.file)
     if not file.is_file():
         return []
-    meshes = _MESH.findall(file.read_text(encoding="utf-8")) if file.suffix.lower() == ".xml" else []
-    return [file, *sorted(mesh for mesh in {file.parent / name for name in meshes} if mesh.is_file())]
+    found, left = {file}, [file]
+    while left:
+        named = {path for name in _named(left.pop()) if (path := file.parent / name).is_file()}
+        left += named - found
+        found |= named
+    return [file, *sorted(found - {file})]
+
+
+def _named(file: Path) -> set[str]:
+    """The files that a Mitsuba XML names: meshes, pictures and XMLs that it includes; of others nothing."""
+    if file.suffix.lower() != ".xml":
+        return set()
+    try:
+        elements = list(ET.parse(file).iter())  # noqa: S314  (no entity of another file is read)
+    except (ET.ParseError, ValueError):
+        return set()  # the ray tracer says what is wrong
+    values = [e.get("value") for e in elements if e.get("name") == "filename"]
+    return {name for name in (*values, *(e.get("filename") for e in elements)) if name}
 
 
 def _same_links(paths: PathSet, data: ChannelData | PowerData, case: Case) -> PathSet:

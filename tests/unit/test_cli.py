@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from dtprob.cli import COMMANDS, main, parser
-from dtprob.inference import Posterior
+from dtprob.inference import SVI, Posterior
 
 MODEL = """
 import jax.numpy as jnp
@@ -314,6 +314,20 @@ def test_a_checkpoint_of_another_run_is_not_gone_on_with(case, capsys, tmp_path)
     assert main(["fit", str(case), "--out", str(out), "--resume"]) == 0
     assert "beginning anew" in capsys.readouterr().out
     assert {entry.name for entry in out.iterdir()} == {"posterior.nc", "posterior.identity", "summary.json"}
+
+
+def test_a_run_that_ends_before_its_first_checkpoint_leaves_no_other_ones(case, monkeypatch, tmp_path):
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "posterior.checkpoint").write_text("of something else")
+    (out / "posterior.begun").write_text("something else")
+    change(case, 'name = "laplace"', 'name = "svi"\n[engine.options]\nsteps = 20\ndraws = 20')
+    words = ["fit", str(case), "--out", str(out), "--resume"]
+    with monkeypatch.context() as broken:
+        broken.setattr(SVI, "__call__", lambda *_, **__: sys.exit(3))
+        with pytest.raises(SystemExit):
+            main(words)
+    assert main(words) == 0
 
 
 def test_a_failed_run_leaves_no_results_of_an_earlier_one(case, tmp_path):

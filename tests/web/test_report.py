@@ -169,7 +169,8 @@ def test_absent_parts_leave_a_page(examples: dict[str, Any]) -> None:
         report["where"] = {"sites": [], "coordinates": []}
         for cause in report["causes"]:
             cause |= {"closed_fraction": None, "size": {}}
-        Page(render(report, xr.DataTree.from_dict({"/where": xr.Dataset()}), title="x"))
+        page = Page(render(report, xr.DataTree.from_dict({"/where": xr.Dataset()}), title="x"))
+        assert "Written by dtprob. " in " ".join(page.words)
 
 
 def test_long_tables_are_folded_but_complete(examples: dict[str, Any]) -> None:
@@ -236,6 +237,32 @@ def test_unconfirmed_signs_are_not_called_a_gap(examples: dict[str, Any]) -> Non
     text = Page(render(report, None, title="x")).text
     assert "There are signs of device disconnected (3), but the data do not confirm them." in text
     assert "The gap is real" not in text
+
+
+def _with_candidates(report: dict[str, Any], judged: int, absorbed: int) -> str:
+    """The words of its page with so many candidates that could be judged, and so many that could not."""
+    rows = report["screening"]
+    clear = [row for row in rows if not row["absorbed_by"]]
+    dull = next(row for row in rows if row["absorbed_by"])
+    page = render({**report, "screening": [*clear[:judged], *[dull] * absorbed]}, None, title="x")
+    return " ".join(" ".join(Page(page).words).split())
+
+
+def test_candidates_that_could_not_be_judged_are_not_called_tried(examples: dict[str, Any]) -> None:
+    quiet, unknown = examples["NO_GAP"](), examples["UNLISTED"]()
+    assert "Of 3 candidates none explains" in _with_candidates(quiet, 3, 2)
+    assert "The one candidate that could be judged explains" in _with_candidates(quiet, 1, 2)
+    assert "No candidate could be judged." in _with_candidates(quiet, 0, 2)
+    assert "3 candidates were tried" in _with_candidates(unknown, 3, 2)
+    assert "One candidate was tried; with it" in _with_candidates(unknown, 1, 0)
+    assert "One effect was screened before" in _with_candidates(unknown, 1, 0)
+    assert "No candidate could be judged." in _with_candidates(unknown, 0, 1)
+
+
+def test_one_group_is_told_as_one(examples: dict[str, Any]) -> None:
+    report = examples["NO_GAP"]()
+    report["fit"] |= {"n_clusters": 1, "n_observations": 1000}
+    assert "1\u202f000 observations in 1 independent group." in render(report, None, title="x")
 
 
 def test_text_of_users_is_escaped(examples: dict[str, Any]) -> None:

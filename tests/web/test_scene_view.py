@@ -7,6 +7,7 @@ import pytest
 import xarray as xr
 
 from dtprob.report import render
+from dtprob.report.charts import scene_charts
 from dtprob.report.scene_view import scene
 
 
@@ -41,6 +42,22 @@ def test_lines_and_shares(paths: xr.Dataset) -> None:
     np.testing.assert_array_equal(before.excess, [1.0, 8.0, -0.5, 6.0])
     assert [(name, share) for name, _, _, share in before.objects] == [("wall_2", pytest.approx(14 / 15))]
     assert after.objects[0][3] == pytest.approx(1 / 15)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf])
+def test_a_path_without_a_number_is_left_out(paths: xr.Dataset, value: float) -> None:
+    """It cost the whole report."""
+    paths["before"][0, 0] = value
+    report: Any = {"gap": {"after": 0.5}}
+    before, after = scene_charts(report, xr.DataTree.from_dict({"paths": paths}))
+    assert all("3 paths; share of the excess on paths by way of wall 2" in one.svg for one in (before, after))
+    assert "by way of wall 2 100%" in before.svg
+
+
+def test_paths_that_meet_nothing_are_told_without_objects(paths: xr.Dataset) -> None:
+    report: Any = {"gap": {"after": None}}
+    (chart,) = scene_charts(report, xr.DataTree.from_dict({"paths": paths.isel(path=[0])}))
+    assert "Scene from above, the twin as it is: 2 paths." in chart.svg
 
 
 def test_the_page_draws_the_scene(paths: xr.Dataset, examples: dict[str, Any], gap: xr.DataTree) -> None:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
+from dtprob.gap.diagnosis import Diagnosis
 from dtprob.report.axis_charts import closed_charts, coordinate_charts, difference_charts
 from dtprob.report.charts import plan_charts
 
@@ -31,9 +32,28 @@ def test_a_value_outside_is_chance_where_nothing_is_found() -> None:
     assert "outside by chance" not in caption("LISTED", [0.0, 9.0, -1.0])
 
 
+@pytest.mark.parametrize("axis", ["hours_after_rain", "after_rain"])
+@pytest.mark.parametrize("after", [None, 0.5])
+def test_an_axis_may_be_called_after_something(axis: str, after: float | None) -> None:
+    report: Any = {"verdict": "LISTED", "where": {"coordinates": []}, "gap": {"after": after}}
+    values = {f"{name}_{axis}": (axis, np.array([0.0, 9.0])) for name in ("gap", "gap_after")}
+    (chart,) = coordinate_charts(report, xr.DataTree.from_dict({"where": xr.Dataset(values)}))
+    assert ("; after, the highest excess" in chart.svg) is (after is not None)
+
+
 def test_what_was_not_observed_is_said() -> None:
     assert "2 not shown: nothing was observed there." in caption("NO_GAP", [0.0, np.nan, 1.0, np.nan])
     assert "not shown" not in caption("NO_GAP", [0.0, 1.0])
+
+
+def test_a_slash_in_an_axis_costs_no_map() -> None:
+    """The diagnosis was lost when its maps were to be written."""
+    maps = {"where": xr.Dataset({"gap_site/floor": ("site/floor", np.array([0.0, 9.0]))})}
+    gap = Diagnosis("UNLISTED", "", (), {}, maps).to_datatree()
+    blocks = [{"axes": {"site/floor": [1, 1]}, "p_value": 0.001, "share": 1.0}]
+    report: Any = {"verdict": "UNLISTED", "where": {"coordinates": blocks}, "gap": {"after": None}}
+    (chart,) = coordinate_charts(report, gap)
+    assert "highest excess is 9.00" in chart.svg
 
 
 def closed(found: list[float], expected: list[float], nats: float) -> str:

@@ -2,6 +2,7 @@
 
 import functools
 import re
+from xml.etree import ElementTree as ET
 
 import matplotlib as mpl
 import numpy as np
@@ -79,6 +80,28 @@ def test_interval_plot_shows_its_numbers() -> None:
     assert any(np.array_equal(x, [-2.0, 0.0]) for x in drawn)
 
 
+def test_a_long_name_takes_more_lines_and_no_room_from_its_interval() -> None:
+    """Three effects with their instances; such a name shrank the axes to a quarter."""
+    names = [
+        "receiver displacement (receiver 11), material mismatch (all concrete 50mm) and timing offset",
+        "b",
+    ]
+    long, short = (
+        interval_plot([IntervalRow(name, 1.0, 0.0, 2.0)] * 2, label="closed (%)") for name in names
+    )
+    svg, _ = inline_svg(long, "a"), inline_svg(short, "a")
+    assert long.axes[0].get_position().width == pytest.approx(short.axes[0].get_position().width)
+    assert long.get_figheight() > short.get_figheight()
+    assert "timing offset</text>" in svg
+
+
+def test_a_name_in_any_script_makes_no_noise() -> None:
+    """The page has fonts of its own: that matplotlib's lacks a sign is no news."""
+    svg = inline_svg(coordinate_map([0.0, 1.0], [0.0, 1.0], label="距離\x0b", threshold=1.0), "距離\x0b")
+    assert "距離" in svg
+    assert ET.fromstring(svg).tag == "svg"  # noqa: S314  (of our own)
+
+
 def test_gap_track_bars_start_at_the_lower_end_of_the_floor() -> None:
     axes = _figures()["gap"].axes[0]
     before, after = axes.patches
@@ -97,6 +120,15 @@ def test_classes_cover_the_values() -> None:
     assert classes([1e9]) == len(classes.colours) - 1
     assert np.all(np.diff(classes(np.linspace(-1, 5, 50))) >= 0)
     assert len(classes_for(np.zeros(4)).colours) >= 1
+
+
+@pytest.mark.parametrize("others", [np.random.default_rng(0).normal(size=100), np.zeros(100)])
+def test_one_bad_link_of_a_hundred_has_a_class_of_its_own(others: np.ndarray) -> None:
+    """It looked like the worst of those that fit, since the classes ended there."""
+    classes = classes_for(np.append(others, 60.0))
+    rank = classes(np.append(others, 60.0))
+    assert np.max(rank[:-1]) < rank[-1]
+    assert classes.edges[1] - classes.edges[0] > 1e-3
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK])

@@ -2,6 +2,7 @@
 
 import pytest
 
+from dtprob.effects import summaries
 from dtprob.gap.fitting import soundness
 from dtprob.report import names
 from dtprob.report.advice import ADVICE, family
@@ -30,6 +31,7 @@ def test_only_what_is_hardly_chance_is_located() -> None:
 def test_names_become_words() -> None:
     assert names.words("iq_imbalance") == "I/Q imbalance"
     assert names.words("object_displacement[building_2]") == "object displacement (building 2)"
+    assert names.words("bias[rack[3]]") == "bias (rack[3])"
     assert names.together(["a_b", "c", "ack_loss"]) == "a b, c and ACK loss"
     assert names.listing([]) == ""
     assert names.site_words("arrival") == "directions of arrival"
@@ -61,6 +63,8 @@ def test_user_terms_share_unit_and_decimals() -> None:
     assert names.user_terms("label_rmse", 0.5, None) == ["0.500"]
     assert names.user_terms("channel_nmse_db", -3.14, -17.8) == ["−3.1\u202fdB", "−17.8\u202fdB"]
     assert names.user_terms("delay_s", 1e-9, None) == ["1.00\u202fns"]
+    assert names.user_terms("power_w", 1e-3, None) == ["0\u202fdBm"]
+    assert names.user_terms("power_w_rmse", 0.308, 0.2) == ["0.31\u202fW", "0.20\u202fW"]
     assert names.user_terms("throughput_error", 0.127013, 0.1270131) == ["0.1270", "0.1270"]
     assert names.is_unchanged("throughput_error", 0.127, 0.1275)
     assert not names.is_unchanged("throughput_error", 0.236, 0.219)
@@ -282,6 +286,7 @@ def test_advice_reads_as_an_imperative() -> None:
     assert family("blockage[wall_3]") == "blockage"
     assert advice("blockage[wall_3]") == ADVICE["blockage"]
     assert "new_effect" not in ADVICE
+    assert set(ADVICE) == set(summaries())
     assert advice("new_effect[2]") == "add new effect (2), with its estimated size, to the twin"
     for text in ADVICE.values():
         assert text[0].islower()

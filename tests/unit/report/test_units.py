@@ -50,6 +50,21 @@ def test_an_interval_has_one_unit_and_two_digits_of_its_width() -> None:
     assert reading(2.0, 2.0, 2.0, "1").interval == "2.00 to 2.00"
 
 
+@pytest.mark.parametrize(
+    ("ends", "shown"),
+    [
+        ((1_234_567.0, 1_230_000.0, 1_239_000.0), "1.2346×10⁶, 1.2300×10⁶ to 1.2390×10⁶"),
+        ((2.34e-5, 2.33e-5, 2.35e-5), "2.340×10⁻⁵, 2.330×10⁻⁵ to 2.350×10⁻⁵"),
+        ((2.3e7, 1e7, 4e7), "2.3×10⁷, 1.0×10⁷ to 4.0×10⁷"),
+        ((999_999.0, 999_000.0, 1_000_500.0), "999999, 999000 to 1.0005×10⁶"),
+    ],
+)
+def test_powers_of_ten_show_the_interval_too(ends: tuple[float, float, float], shown: str) -> None:
+    """The ends of a narrow interval far from 1 looked the same."""
+    size = reading(*ends, "1")
+    assert f"{size.mean}, {size.interval}".replace("\u202f", "") == shown
+
+
 def test_dbm_is_not_used_for_what_may_be_zero() -> None:
     assert scale_for([0.0, 1e-3], "W").unit == "W"
 

@@ -10,12 +10,13 @@ import pytest
 from numpyro import handlers
 from numpyro.infer.util import log_density
 
-from dtprob.case import load_case
+from dtprob.case import SceneSection, load_case
 from dtprob.data import ChannelData, read, write
 from dtprob.effects.rewriting import effects_of
 from dtprob.errors import InputError
 from dtprob.raytracing import storage
 from dtprob.workflow import prepare
+from dtprob.workflow.scene import scene_files
 
 DEMO = Path(__file__).parents[3] / "dtprob" / "data" / "demo"
 
@@ -138,6 +139,31 @@ def test_traced_paths_are_kept_for_the_next_run(folder, monkeypatch):
     monkeypatch.setattr("dtprob.workflow.scene.edition", lambda: "another state of the code")
     prepare(load_case(folder / "case.toml"), need="fit", cache=folder / "out")
     assert len(traced) == 3
+
+
+def test_a_scene_is_made_of_all_that_it_names(tmp_path):
+    """In whatever order and encoding; a file that was overlooked could change, and its old paths were taken."""
+    for name in ("first.ply", "second.ply", "third.ply"):
+        (tmp_path / name).write_text("a house")
+    shape = '<shape type="ply"><string {}/></shape>'
+    first, second, third = (
+        shape.format(text)
+        for text in (
+            'name="filename" value="first.ply"',
+            'value="second.ply" name="filename"',
+            'name="filename" value="third.ply"',
+        )
+    )
+    (tmp_path / "more.xml").write_text(
+        f'<scene version="2.1.0">{third}<include filename="more.xml"/></scene>'
+    )
+    whole = f'<!-- Straße --><scene version="2.1.0">{first}{second}<include filename="more.xml"/></scene>'
+    text = f'<?xml version="1.0" encoding="iso-8859-1"?>{whole}'
+    (tmp_path / "street.xml").write_bytes(text.encode("iso-8859-1"))
+    found = scene_files(SceneSection(file=str(tmp_path / "street.xml"), frequency=6e9))
+    assert {file.name for file in found} == {"street.xml", "first.ply", "second.ply", "more.xml", "third.ply"}
+    (tmp_path / "street.xml").write_text("<scene")
+    assert len(scene_files(SceneSection(file=str(tmp_path / "street.xml"), frequency=6e9))) == 1
 
 
 def test_a_scene_whose_mesh_has_changed_is_traced_again(folder, monkeypatch):
