@@ -113,7 +113,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     noted = lopsided(problem)
     for note in noted:
         say(f"note: {note}")
-    say(f"fitting the base model to {problem.n_cluster} clusters")
+    say(f"fitting the base model to {problem.n_cluster} clusters ({problem.cluster_name})")
     with differentiated_forwards():
         start = based(problem, keys[0], polished=settings.polished, say=say)
     problem, base = start.problem, start.fitted

@@ -151,7 +151,7 @@ def model(
 
     Args:
         axes: for a site, the names of all its dimensions, first to last.
-        cluster: the axis whose entries are independent of one another (a plate's name); by default the first plate.
+        cluster: the axis whose entries are independent of one another (a plate's name); by default the first observed axis.
         measures: in whose terms a diagnosis tells how large a gap is, beside the errors of observed sites: the root mean
             square, over clusters, of the mean difference between predicted and seen.
     """

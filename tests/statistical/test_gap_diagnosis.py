@@ -289,6 +289,7 @@ def test_a_base_fit_in_a_wrong_basin_is_taken_back(monkeypatch):
     lines = []
     found = run(wave, data, (bend(), ripple()), say=lines.append)
     assert any("starting again" in line for line in lines)
+    assert "fitting the base model to 12 clusters (row)" in lines
     assert found.verdict == "NO_GAP"
     assert found.to_report()["fit"]["nuisances"][0]["mean"] == pytest.approx(2.0, abs=0.02)
 

@@ -185,7 +185,7 @@ def _better(
     tolerance: float,
 ) -> _Trial:
     """The first of ever more damped steps that raises the log posterior, or the last that did not."""
-    lowest, longest = _lowest(problem, active, x), farthest(problem)[active.global_index]
+    lowest, longest = lowest_steps(problem, active, x), farthest(problem)[active.global_index]
     trial = _Trial(x, value, 0.0, damping)
     for _ in range(_TRIES):
         step = newton_step(system, damping, lowest)
@@ -201,7 +201,7 @@ def _better(
     return trial
 
 
-def _lowest(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
+def lowest_steps(problem: Problem, active: Active, x: np.ndarray) -> np.ndarray:
     """The smallest step of each global coordinate: one-sided parameters stay on their side of the null."""
     lowest = np.full(len(x), -np.inf)
     for effect in active.effects:

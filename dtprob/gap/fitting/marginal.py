@@ -8,7 +8,7 @@ from typing import Final
 
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from dtprob.gap.fitting.active import LOG_2PI, Active, activate, basis, own_basis
 from dtprob.gap.fitting.density import cluster_terms, curved, moved, rescored, system_at, terms_of
@@ -77,7 +77,9 @@ def _widened(
     x: Float[np.ndarray, " dimension"],
     local: Float[np.ndarray, "cluster own own"] | None,
 ) -> Float[np.ndarray, " cluster"]:
-    """What it adds to clusters' log likelihoods that states are only known with the covariance of the fit.
+    """What it adds to clusters' log likelihoods that states are only known with their covariance at the fit, all else held.
+
+    Without that, what a level that all states share leaves open would excuse what moves a whole cluster.
 
     With residuals e at the mode of the own coordinates, tangents A of these and W of the states, P the states' covariance,
     K = W P W' and M = 1 - A H^-1 A', by the lemmas of Woodbury and Sylvester: (e' (1 + K M)^-1 K e - log |1 + K M|) / 2.
@@ -95,13 +97,22 @@ def _widened(
     along = np.concatenate([basis(problem, active)[: len(inner)][inner], own_basis(problem, active)])
     e, w = (np.asarray(part) for part in problem.compiled.linearised(x, along))
     states, own = np.split(w, [inner.sum()], axis=-1)
-    known = states @ fitted.covariance[np.ix_(inner, inner)] @ np.swapaxes(states, 1, 2)
+    known = states @ _given_others(fitted.covariance, inner) @ np.swapaxes(states, 1, 2)
     told = np.eye(e.shape[1])
     if local is not None:
         told = told - own @ np.linalg.solve(local, np.swapaxes(own, 1, 2))
     wide = np.eye(e.shape[1]) + known @ told
     inside = (e * np.linalg.solve(wide, known @ e[..., None])[..., 0]).sum(1)
     return 0.5 * (inside - np.linalg.slogdet(wide)[1])
+
+
+def _given_others(
+    covariance: Float[np.ndarray, "shared shared"], chosen: Bool[np.ndarray, " shared"]
+) -> Float[np.ndarray, "chosen chosen"]:
+    """Covariance of the chosen coordinates where the others are held."""
+    cross = covariance[np.ix_(chosen, ~chosen)]
+    others = covariance[np.ix_(~chosen, ~chosen)]
+    return covariance[np.ix_(chosen, chosen)] - cross @ np.linalg.solve(others, cross.T)
 
 
 def own_mode(

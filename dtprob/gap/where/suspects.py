@@ -18,6 +18,8 @@ _MOST_WEIGHTS: Final = 4096
 _NEARLY: Final = 0.8
 _FEW: Final = 16
 """Share of the surest family's log p-value that another one has at least where it may be named instead, and its weights."""
+_FARTHEST: Final = 1e-20
+"""p-value below which all are as sure: replicates give a few weights a longer tail than hundreds."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +65,7 @@ def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
     """
     if not _overlaps(surest.family.pattern):
         return surest
-    most = _NEARLY * np.log(surest.p_value)
+    most = _NEARLY * np.log(max(surest.p_value, _FARTHEST))
     alike = [t for t in tests if t.family.kind == surest.family.kind and np.log(t.p_value) <= most]
     few = [t for t in alike if len(t.variance) <= _FEW or _overlaps(t.family.pattern)]
     return max(few, key=_evidence)

@@ -20,6 +20,7 @@ from dtprob.gap.fitting.determined import deviation_of_spread
 from dtprob.gap.fitting.informed import informed
 from dtprob.gap.fitting.plausible import limits, nulls, plausible_spread, scales
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.which.stepped import place_draws, stepped
 from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.inference.laplace import Laplace
 
@@ -70,7 +71,7 @@ def _posterior(
 def _normal(
     problem: Problem, fitted: fitting.Fit, means: Sequence[Effect], key: jax.Array, count: int
 ) -> dict[str, np.ndarray]:
-    """Draws of the refit's own normal approximation, within what the effects' priors allow."""
+    """Draws of the refit's own normal approximation, within what the effects' priors allow; a step's place by its own."""
     active = activate(problem, fitted.effects, spread=fitted.spread)
     gradient = system_at(problem, active, fitted.x).gradient
     pushed = fitting.pushed_out(problem, active, fitted.x, gradient)
@@ -81,6 +82,8 @@ def _normal(
         low[place], high[place] = limits(effect)
     rng = np.random.default_rng(np.asarray(jax.random.bits(key, (4,))))
     draws = bounded_draws(Bounded(mean, fitted.covariance, low, high), count, rng)
+    for coordinate in stepped(problem, active, fitted):
+        draws[:, coordinate] = place_draws(problem, active, fitted, coordinate, count=count, rng=rng)
     names = [e.site_name(p.name) for e in means for p in e.parameters]
     return {n: draws[:, np.searchsorted(fitted.global_index, problem.layout[n].index[0])] for n in names}
 

@@ -194,3 +194,31 @@ def test_devices_that_are_left_out_are_judged_by_what_is_not_known_of_days():
         spread = covariance[np.ix_(own, own)] - gain @ covariance[np.ix_(seen, own)]
         expected = stats.multivariate_normal(gain @ y[seen], spread).logpdf(y[own])
         assert abs(marginal(problem, found)[left] - expected) < 0.02, left
+
+
+@pytest.mark.parametrize("shift", [0.0, 1.0])
+def test_what_moves_all_readings_of_a_cluster_is_no_doubt_of_levels(shift):
+    """Sites' levels and their centre are each known poorly, their sums well; those excused most of a slot's shift."""
+    rng = np.random.default_rng(6)
+    slots, sites = 40, 12
+    y = 1.0 + 0.5 * rng.normal(size=sites) + 0.3 * rng.normal(size=(slots, sites))
+    kept = (np.arange(slots) % 4 > 0).astype(float)
+    y[kept == 0] += shift
+
+    def levels(y=None):
+        centre = numpyro.sample("centre", dist.Normal(0.0, 3.0))
+        spread = numpyro.sample("spread", dist.LogNormal(jnp.log(0.5), 0.01))
+        with numpyro.plate("site", sites, dim=-1):
+            own = numpyro.sample("own", dist.Normal(0.0, 1.0))
+            with numpyro.plate("slot", slots, dim=-2):
+                mean = numpyro.deterministic("mean", jnp.broadcast_to(centre + spread * own, (slots, sites)))
+                numpyro.sample("y", dist.Normal(mean, 0.3), obs=y)
+
+    problem = Problem(levels, {"y": jnp.asarray(y)}, [], "slot")
+    found = fit(problem, problem.null(), weights=kept)
+    values = {name: float(problem.compiled.sites(found.x)[name]) for name in ("centre", "spread")}
+    seen = y[kept > 0] - values["centre"]
+    variance = 1 / (1 / values["spread"] ** 2 + len(seen) / 0.3**2)
+    level = values["centre"] + variance * seen.sum(axis=0) / 0.3**2
+    expected = stats.norm(level, np.sqrt(0.3**2 + variance)).logpdf(y[kept == 0]).sum(axis=1)
+    np.testing.assert_allclose(marginal(problem, found)[kept == 0], expected, rtol=1e-3, atol=1e-2)

@@ -8,7 +8,7 @@ import pytest
 
 from dtprob.gap.where.curves import Curves, curves
 from dtprob.gap.where.families import Family, Pattern
-from dtprob.gap.where.family_test import FamilyTest
+from dtprob.gap.where.family_test import FamilyTest, family_test
 from dtprob.gap.where.suspects import plainest, suspects
 
 N_ROW = 240
@@ -67,3 +67,14 @@ def test_what_varies_along_a_column_is_not_named_by_one_of_many_places_that_show
     assert plainest(one, [one, wave]).label == "additive, place 3"
     other = wave._replace(family=dataclasses.replace(wave.family, kind="spread"))
     assert plainest(near, [near, other]) is near
+
+
+def test_far_out_the_evidence_names_a_family_and_not_the_tail_of_replicates(ripples):
+    """Eight places out by 12, a cosine by 25: of 99 replicates no single score has a tail as thin as the places' sum."""
+    random = np.random.default_rng(2)
+    places = Curves("near a place", np.eye(8), overlaps=True, places=tuple(f"place {i}" for i in range(8)))
+    scores, single = random.normal(size=(100, 8)), random.normal(size=(100, 1))
+    scores[0], single[0] = 12.0, 25.0
+    near, wave = family_test(family_of(places), scores), family_test(family_of(ripples.band(0, 1)), single)
+    assert near.p_value < 1e-60 < wave.p_value < 1e-30
+    assert plainest(near, [near, wave]) is wave

@@ -1,5 +1,7 @@
 """Sizes of accepted causes: engines agree, beside random fields too."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -103,3 +105,48 @@ def test_sizes_stay_within_what_their_priors_allow():
     for name in ("share", "loss"):
         for end in ("low", "mean", "high"):
             assert getattr(normal[name], end) == pytest.approx(getattr(exact[name], end), abs=0.1)
+
+
+@pytest.mark.parametrize("since", [20.3, 41.7, 55.2])
+def test_the_interval_of_a_step_is_what_the_data_tell(since):
+    """No reading changes with the day of a step, moved a little; its interval was its prior's, 12 to 62 of 60 days."""
+
+    def two(day, y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+        with numpyro.plate("row", len(day)):
+            mean = numpyro.deterministic("mean", level + 0.0 * day)
+            numpyro.sample("y", dist.Normal(mean, 2.0), obs=y)
+
+    rng = np.random.default_rng(2)
+    day = np.sort(rng.uniform(0.0, 60.0, 240))
+    y = 1.0 - 2.0 * (day >= since) + 2.0 * rng.normal(size=240)
+    at = Parameter(
+        "since", dist.Normal(40.0, 15.0), null=40.0, is_place=True, tried=tuple(np.arange(1.0, 60.0))
+    )
+    drop = Effect(
+        "drop",
+        {"mean": lambda value, p, context: value - p["loss"] * (context["day"] >= p["since"])},
+        (Parameter("loss", dist.HalfNormal(5.0)), at),
+    )
+    days = np.linspace(
+        0.0, 80.0, 1601
+    )  # the exact posterior: the level and the loss integrated out on a grid of losses
+    losses = np.linspace(0.0, 6.0, 301)
+    after = day >= days[:, None]
+    count, total = after.sum(1)[:, None], (after @ y)[:, None]
+    variance = 4.0 / len(y)  # the level's prior is flat beside it
+    square = (y**2).sum() + 2 * losses * total + losses**2 * count
+    mean = y.mean() + losses * count / len(y)
+    log_density = (
+        mean**2 / variance - square / 4.0 - (losses / 5.0) ** 2 - ((days[:, None] - 40.0) / 15.0) ** 2
+    ) / 2
+    density = np.exp(log_density - log_density.max()).sum(1)
+    exact = np.interp([0.05, 0.95], np.cumsum(density) / density.sum(), days)
+    problem = Problem(two, {"day": jnp.asarray(day), "y": jnp.asarray(y)}, [drop]).with_live(["drop"])
+    start = problem.null()
+    start[problem.layout.of(drop)] = 2.0, days[density.argmax()]
+    found = fit(problem, start, ["drop"])
+    start[problem.layout.of(drop)] = found.x[problem.layout.of(drop)][0], days[density.argmax()]
+    sizes, _ = confirm(problem, replace(found, x=start), [drop], jax.random.key(0), Laplace(draws=4000))
+    told = next(size for size in sizes if size.name == "since")
+    np.testing.assert_allclose([told.low, told.high], exact, atol=0.1 * (exact[1] - exact[0]) + 0.2)
