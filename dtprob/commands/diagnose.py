@@ -113,7 +113,7 @@ def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tupl
 
 
 def write_diagnosis(out: Path, report: Mapping[str, Any], gap: DataTree, *, title: str) -> None:
-    """Write gap.nc, report.html and, last, report.json.
+    """Write gap.nc, report.html and, last, report.json; where the page cannot be drawn, the others are written all the same.
 
     Args:
         out: the folder.
@@ -123,5 +123,10 @@ def write_diagnosis(out: Path, report: Mapping[str, Any], gap: DataTree, *, titl
     """
     with atomic_write(out / "gap.nc") as temporary:
         gap.to_netcdf(temporary, engine="h5netcdf")
-    write_text(out / "report.html", render(report, gap, title=title))
-    write_text(out / "report.json", to_json(report))
+    text = to_json(report)
+    try:
+        write_text(out / "report.html", render(report, gap, title=title))
+    except Exception:
+        write_text(out / "report.json", text)
+        raise
+    write_text(out / "report.json", text)
