@@ -113,7 +113,7 @@ def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tupl
 
 
 def write_diagnosis(out: Path, report: Mapping[str, Any], gap: DataTree, *, title: str) -> None:
-    """Write gap.nc, report.html and, last, report.json; where the page cannot be drawn, the others are written all the same.
+    """Write gap.nc, report.html and, last, report.json, which a page that cannot be drawn does not cost.
 
     Args:
         out: the folder.

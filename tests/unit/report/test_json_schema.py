@@ -5,7 +5,9 @@ import math
 from typing import Any
 
 import pytest
+import xarray as xr
 
+from dtprob.commands import diagnose
 from dtprob.errors import InputError
 from dtprob.report.json_schema import VERDICTS, to_json, validate
 
@@ -121,3 +123,14 @@ def test_optional_entries_may_be_there() -> None:
     fit = {"nuisances": [nuisance], "converged": True, "n_clusters": 3, "n_observations": 12, "warnings": []}
     cause = _cause(physics="p", strata={"estimate": [1.0, 2.0]}, plausible=True)
     validate(_report(summary="s", screening=[candidate], fit=fit, causes=[cause]))
+
+
+def test_a_page_that_cannot_be_drawn_does_not_cost_the_answer(tmp_path, monkeypatch):
+    def undrawn(*_: object, **__: object) -> str:
+        raise ZeroDivisionError
+
+    monkeypatch.setattr(diagnose, "render", undrawn)
+    with pytest.raises(ZeroDivisionError):
+        diagnose.write_diagnosis(tmp_path, _report(), xr.DataTree(), title="a page")
+    assert json.loads((tmp_path / "report.json").read_text()) == _report()
+    assert not (tmp_path / "report.html").exists()

@@ -6,9 +6,7 @@ import re
 from typing import Any
 
 import pytest
-import xarray as xr
 
-from dtprob.commands import diagnose
 from dtprob.errors import InputError
 from dtprob.gap.diagnosis import plain
 from dtprob.report import names, render, to_json, validate
@@ -88,14 +86,3 @@ def test_numbers_that_are_not_determined_are_dashes_without_a_unit() -> None:
 def test_a_family_with_an_instance_that_is_never_seen_has_no_size() -> None:
     (family,) = detectable_families(plain(_report("NO_GAP"))["detectable"])
     assert (family.size, family.count) == (DASH, 2)
-
-
-def test_a_page_that_cannot_be_drawn_does_not_cost_the_answer(tmp_path, monkeypatch):
-    def undrawn(*_: object, **__: object) -> str:
-        raise ZeroDivisionError
-
-    monkeypatch.setattr(diagnose, "render", undrawn)
-    with pytest.raises(ZeroDivisionError):
-        diagnose.write_diagnosis(tmp_path, _report("LISTED"), xr.DataTree(), title="a page")
-    assert json.loads((tmp_path / "report.json").read_text())["verdict"] == "LISTED"
-    assert not (tmp_path / "report.html").exists()
