@@ -117,7 +117,9 @@ def run(
                 write_text(out / name / "error.txt", f"{error}\n")
             say(f"{done} of {len(jobs)}")
     if failed:
-        raise RuntimeError(f"{len(failed)} cases failed, see error.txt of {', '.join(failed[:5])}")
+        raise RuntimeError(
+            f"{len(failed)} of {len(jobs)} cases failed, see error.txt of {', '.join(failed[:5])}"
+        )
 
 
 def score(answers: Path, key: Path) -> None:
