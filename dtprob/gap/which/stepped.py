@@ -48,18 +48,18 @@ def place_draws(
         rng: what draws.
     """
     index = fitted.global_index[coordinate]
-    half = _FAR * float(np.sqrt(fitted.covariance[coordinate, coordinate]))
-    low, high = fitted.x[index] - half, fitted.x[index] + half
-    points, values = np.zeros(0), np.zeros(0)
-    for _ in range(2):
+    at, half = float(fitted.x[index]), _FAR * float(np.sqrt(fitted.covariance[coordinate, coordinate]))
+
+    def looked_at(low: float, high: float) -> tuple[np.ndarray, np.ndarray]:
         points = np.linspace(low, high, _POINTS)
-        values = np.array([_value(problem, active, fitted.x, coordinate, point) for point in points])
-        likely = points[values > values.max() - _LIKELY]
-        spacing = points[1] - points[0]
-        low, high = likely.min() - spacing, likely.max() + spacing
+        return points, np.array([_value(problem, active, fitted.x, coordinate, point) for point in points])
+
+    coarse, values = looked_at(at - half, at + half)
+    likely, spacing = coarse[values > values.max() - _LIKELY], float(coarse[1] - coarse[0])
+    points, values = looked_at(float(likely.min()) - spacing, float(likely.max()) + spacing)
     chances = np.exp(values - values.max())
     chosen = rng.choice(points, count, p=chances / chances.sum())
-    return chosen + spacing * rng.uniform(-0.5, 0.5, count)
+    return chosen + (points[1] - points[0]) * rng.uniform(-0.5, 0.5, count)
 
 
 def _value(problem: Problem, active: Active, x: np.ndarray, coordinate: int, point: float) -> float:
