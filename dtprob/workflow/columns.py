@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import re
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -11,7 +13,7 @@ from dtprob.models.indices import check_indices
 
 
 def check_columns(file: Path, model: Model, arguments: Data, columns: Iterable[str]) -> None:
-    """Look for a column of each argument that the model cannot do without, and at indices.
+    """Look for each column that the model cannot do without, for others that are spelt otherwise, and at indices.
 
     Args:
         file: the table.
@@ -20,11 +22,22 @@ def check_columns(file: Path, model: Model, arguments: Data, columns: Iterable[s
         columns: names of the table's columns.
 
     Raises:
-        InputError: a column is missing, or an index in one is beyond an array's end.
+        InputError: a column is missing or spelt otherwise, or an index in one is beyond an array's end.
     """
     there = list(columns)
     for name in lacking(model, arguments):
         close = nearest(name, there)
         remedy = f"Rename {close!r} there" if close else "Add it, or give it under [model.options]"
         raise InputError(file.name, f"a column {name!r}", ", ".join(there) or "none", remedy)
+    takes = inspect.signature(model).parameters
+    strange = {_plain(name): name for name in there if name not in takes}
+    for name in takes:
+        spelt = strange.get(_plain(name)) if name not in arguments else None
+        if spelt is not None:
+            raise InputError(file.name, f"a column {name!r}", repr(spelt), f"Rename {spelt!r} there")
     check_indices(model, arguments, f"{file.name}, column")
+
+
+def _plain(name: str) -> str:
+    """A name without what people write in different ways: capitals, what stands between words, and a unit in brackets."""
+    return re.sub(r"[(\[].*|[\W_]", "", name).casefold()

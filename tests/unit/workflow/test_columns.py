@@ -11,7 +11,7 @@ MODEL = """import numpyro
 import numpyro.distributions as dist
 
 
-def street(distance, site, level, *, sites=3):
+def street(distance, site, level=None, *, sites=3):
     with numpyro.plate("sites", sites):
         own = numpyro.sample("own", dist.Normal(0.0, 5.0))
     slope = numpyro.sample("slope", dist.Normal(-0.1, 0.1))
@@ -48,6 +48,15 @@ def test_a_missing_column_is_named_with_those_that_are_there(tmp_path):
     message = r"t\.csv: expected a column 'distance', got distance \(m\), site, level\. Rename 'distance \(m\)' there"
     with pytest.raises(InputError, match=message):
         prepare(case(tmp_path, header="distance (m),site,level"), need="diagnosis")
+
+
+@pytest.mark.parametrize("spelt", ["Level", "LEVEL", "level (dBm)", "level [dBm]"])
+def test_what_is_observed_may_be_left_out_but_not_spelt_otherwise(tmp_path, spelt):
+    """The model runs without it, and would be told that it observes nothing."""
+    with pytest.raises(InputError, match=r"t\.csv: expected a column 'level', got '.*'\. Rename '.*' there"):
+        prepare(case(tmp_path, header=f"distance,site,{spelt}"), need="diagnosis")
+    with pytest.raises(InputError, match="model street: expected an observed site"):
+        prepare(case(tmp_path, header="distance,site,other"), need="diagnosis")
 
 
 def test_an_index_beyond_the_end_is_told_with_the_table(tmp_path):
