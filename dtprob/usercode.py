@@ -70,7 +70,7 @@ def _load_module(name: str, parts: list[str], folder: Path) -> ModuleType:
         except Terminated:
             raise
         except (Exception, SystemExit) as error:
-            got = f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"
+            got = f"{type(error).__name__}: {str(error).splitlines()[0].rstrip('.') if str(error) else ''}"
             raise InputError(f"module {name}", "a module that runs", got, "Correct the module") from error
 
 

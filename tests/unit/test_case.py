@@ -201,11 +201,11 @@ def test_own_module_is_imported_without_a_trace_on_the_path(tmp_path):
 def test_mistakes_in_own_modules_are_named(tmp_path):
     (tmp_path / "own_broken.py").write_text("1 / 0\n")
     (tmp_path / "own_named.py").write_text("def my_model(): ...\n")
-    (tmp_path / "own_leaving.py").write_text("import sys\nsys.exit('no data')\n")
+    (tmp_path / "own_leaving.py").write_text("import sys\nsys.exit('no data.')\n")
     for name, message in {
         "own_absent:model": r"module own_absent: expected a module beside the CASE file \(own_absent\.py\)",
         "own_broken:model": "expected a module that runs, got ZeroDivisionError: division by zero",
-        "own_leaving:model": "expected a module that runs, got SystemExit: no data",
+        "own_leaving:model": "expected a module that runs, got SystemExit: no data. Correct",
         "own_named:mymodel": r"got 'mymodel'\. Did you mean 'my_model'\?",
         "own_named:": "expected 'package.module:function'",
         "../own_named:my_model": "expected 'package.module:function'",
