@@ -13,7 +13,7 @@ from dtprob.gap.model.problem import Problem
 from tests.unit.gap.examples import draw, line
 
 RAISED = Effect("raised", {"mean": lambda v, p, c: v + p["by"]}, (Parameter("by", dist.Normal(0.0, 2.0)),))
-COUNT = 30
+COUNT = 60
 """Data sets."""
 
 
@@ -28,7 +28,7 @@ class Earlier:
         return {"a": 0.7 + self.spread * noise[0], "b": -1.2 + 0.01 * noise[1]}
 
 
-def drawn(spread, count=COUNT):
+def drawn(spread, count):
     """Problems whose level is drawn as the reference says, and their fits."""
     rng = np.random.default_rng(5)
     for seed in range(1, count + 1):
@@ -39,7 +39,7 @@ def drawn(spread, count=COUNT):
 
 @pytest.mark.parametrize("spread", [0.05, 1.0])
 def test_it_is_nothing_on_average_and_as_uncertain_as_it_says(spread):
-    found = [on_earlier_data(problem, fitted) for problem, fitted in drawn(spread)]
+    found = [on_earlier_data(problem, fitted) for problem, fitted in drawn(spread, COUNT)]
     values, variances = np.array(found).T
     assert abs(values.mean()) < 4 * np.sqrt(variances.mean() / COUNT)
     assert 0.4 < values.var() / variances.mean() < 2.5
@@ -49,7 +49,7 @@ def test_it_is_nothing_on_average_and_as_uncertain_as_it_says(spread):
 def test_an_effect_that_does_what_a_known_parameter_does_closes_no_gap_by_chance(spread):
     """At most 1 in 20 establish one; of 30 more than 6 would with probability 6e-4."""
     established = 0
-    for problem, fitted in drawn(spread):
+    for problem, fitted in drawn(spread, COUNT // 2):
         wide = problem.with_live(["raised"])
         full = fit(wide, wide.translate(fitted.x, problem), ["raised"])
         folds = closed.folds(problem.n_cluster, 5)
