@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from numbers import Integral
 from typing import final
 
 import jax.numpy as jnp
@@ -33,6 +34,9 @@ class Clusters:
 
     def __post_init__(self) -> None:
         """Check that the clusters are a partition of the devices."""
+        if any(isinstance(d, bool) or not isinstance(d, Integral) for c in self.members for d in c):
+            got = str([list(c) for c in self.members])
+            raise InputError("clusters", "lists of devices' numbers", got, "Correct the value")
         object.__setattr__(self, "members", tuple(tuple(map(int, c)) for c in self.members))
         listed = sorted(device for cluster in self.members for device in cluster)
         if not listed or listed != list(range(len(listed))) or not all(self.members):

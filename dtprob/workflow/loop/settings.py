@@ -1,6 +1,6 @@
 """The CASE of a running twin: which model, which physical twin, and how the loop goes."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
@@ -165,7 +165,6 @@ def _check_model(case: TwinCase) -> None:
     if options.get("traffic", "memoryless") not in {"memoryless", "markov"}:
         got = str(options["traffic"])
         raise InputError(f"{where} options traffic", "memoryless or markov", got, "Correct the value")
-    _check_clusters(f"{where} options clusters", options["clusters"])
     try:
         kernel, concentration = case.kernel, case.concentration
     except (TypeError, ValueError) as error:
@@ -175,16 +174,6 @@ def _check_model(case: TwinCase) -> None:
         raise InputError(
             f"{where} options", "a capacity from 1, a concentration above 0", got, "Correct them"
         )
-
-
-def _check_clusters(where: str, clusters: object) -> None:
-    """Refuse what is no number of a device, which would be cut to one."""
-
-    def entries(value: object) -> Sequence[object]:
-        return value if isinstance(value, list | tuple) else (value,)
-
-    if {type(device) for cluster in entries(clusters) for device in entries(cluster)} != {int}:
-        raise InputError(where, "lists of devices' numbers", repr(clusters), "Correct the value")
 
 
 def _check_effects(case: TwinCase) -> None:

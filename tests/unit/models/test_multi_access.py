@@ -118,6 +118,8 @@ def test_who_is_delivered_is_the_conditional_bernoulli_law():
     [
         (((0, 1), (1, 2)), "clusters: expected each device once"),
         (((0, 2),), "clusters: expected each device once"),
+        (((0.5, 1),), "clusters: expected lists of devices' numbers"),
+        (((False, True),), "clusters: expected lists of devices' numbers"),
         ((tuple(range(13)),), "clusters: expected at most 12 devices each, got 13"),
     ],
 )

@@ -74,15 +74,16 @@ def test_entries_are_called_as_the_parameter_says(labels, names):
     assert [one.name for one in found] == names
 
 
+def same_everywhere(place, deviation, y=None):
+    """One level at all places, known deviation."""
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    with numpyro.plate("row", len(place)):
+        mean = numpyro.deterministic("mean", level + 0.0 * place)
+        numpyro.sample("y", dist.Normal(mean, deviation), obs=y)
+
+
 def test_sizes_stay_within_what_their_priors_allow():
     """A share that data push to its whole, and a loss that they push against its null, as a sampler finds them."""
-
-    def two(group, y=None):
-        level = numpyro.sample("level", dist.Normal(0.0, 10.0))
-        with numpyro.plate("row", len(group)):
-            mean = numpyro.deterministic("mean", level + 0.0 * group)
-            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
-
     rng = np.random.default_rng(1)
     group = np.arange(60) % 3
     y = 1.25 * (group == 1) - 0.4 * (group == 2) + rng.normal(size=60)
@@ -90,12 +91,13 @@ def test_sizes_stay_within_what_their_priors_allow():
         "both",
         {
             "mean": lambda value, p, context: (
-                value + p["share"] * (context["group"] == 1) + p["loss"] * (context["group"] == 2)
+                value + p["share"] * (context["place"] == 1) + p["loss"] * (context["place"] == 2)
             )
         },
         (Parameter("share", dist.Uniform(0.0, 1.0)), Parameter("loss", dist.HalfNormal(3.0))),
     )
-    problem = Problem(two, {"group": jnp.asarray(group), "y": jnp.asarray(y)}, [effect]).with_live(["both"])
+    data = {"place": jnp.asarray(group), "deviation": jnp.asarray(1.0), "y": jnp.asarray(y)}
+    problem = Problem(same_everywhere, data, [effect]).with_live(["both"])
     found = fit(problem, problem.null(), ["both"])
     normal, exact = (
         {size.name: size for size in confirm(problem, found, [effect], jax.random.key(0), engine)[0]}
@@ -111,12 +113,6 @@ def test_sizes_stay_within_what_their_priors_allow():
 def test_the_interval_of_a_step_is_what_the_data_tell(since):
     """No reading changes with the day of a step, moved a little; its interval was its prior's, 12 to 62 of 60 days."""
 
-    def two(day, y=None):
-        level = numpyro.sample("level", dist.Normal(0.0, 10.0))
-        with numpyro.plate("row", len(day)):
-            mean = numpyro.deterministic("mean", level + 0.0 * day)
-            numpyro.sample("y", dist.Normal(mean, 2.0), obs=y)
-
     rng = np.random.default_rng(2)
     day = np.sort(rng.uniform(0.0, 60.0, 240))
     y = 1.0 - 2.0 * (day >= since) + 2.0 * rng.normal(size=240)
@@ -125,12 +121,11 @@ def test_the_interval_of_a_step_is_what_the_data_tell(since):
     )
     drop = Effect(
         "drop",
-        {"mean": lambda value, p, context: value - p["loss"] * (context["day"] >= p["since"])},
+        {"mean": lambda value, p, context: value - p["loss"] * (context["place"] >= p["since"])},
         (Parameter("loss", dist.HalfNormal(5.0)), at),
     )
-    days = np.linspace(
-        0.0, 80.0, 1601
-    )  # the exact posterior: the level and the loss integrated out on a grid of losses
+    # the exact posterior: the level and the loss integrated out on a grid of losses
+    days = np.linspace(0.0, 80.0, 1601)
     losses = np.linspace(0.0, 6.0, 301)
     after = day >= days[:, None]
     count, total = after.sum(1)[:, None], (after @ y)[:, None]
@@ -142,7 +137,8 @@ def test_the_interval_of_a_step_is_what_the_data_tell(since):
     ) / 2
     density = np.exp(log_density - log_density.max()).sum(1)
     exact = np.interp([0.05, 0.95], np.cumsum(density) / density.sum(), days)
-    problem = Problem(two, {"day": jnp.asarray(day), "y": jnp.asarray(y)}, [drop]).with_live(["drop"])
+    data = {"place": jnp.asarray(day), "deviation": jnp.asarray(2.0), "y": jnp.asarray(y)}
+    problem = Problem(same_everywhere, data, [drop]).with_live(["drop"])
     start = problem.null()
     start[problem.layout.of(drop)] = 2.0, days[density.argmax()]
     found = fit(problem, start, ["drop"])
