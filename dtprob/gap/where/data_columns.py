@@ -49,6 +49,16 @@ def whole_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
     }
 
 
+def all_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
+    """Columns of the data on one axis or several of an observed site, each of its shape."""
+    found = whole_columns(problem, site)
+    for i, axis in enumerate(site.axes):
+        beside = tuple(j for j in range(len(site.shape)) if j != i)
+        for name, column in columns(problem, axis, site.shape[i]).items():
+            found.setdefault(name, np.broadcast_to(np.expand_dims(column, beside), site.shape))
+    return found
+
+
 def _is_within(shape: tuple[int, ...], wide: tuple[int, ...]) -> bool:
     """Whether an array of a shape is broadcast to another one."""
     try:

@@ -25,13 +25,13 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.where.curves import curves
-from dtprob.gap.where.data_columns import whole_columns
+from dtprob.gap.where.data_columns import all_columns, whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.moments import further_moments
-from dtprob.gap.where.quantities import Quantity, groups, quantity
+from dtprob.gap.where.quantities import Quantity, cells, groups, quantity
 from dtprob.gap.where.site_finding import SURE, SiteFinding, rank, shadows_last
 from dtprob.gap.where.suspects import Suspect, plainest, suspects
 
@@ -207,6 +207,9 @@ def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[
             yield found
     for name, (axes, value) in columns.items():
         yield from groups(name, axes, value)
+    for site in problem.declaration.observed.values():
+        if len(site.shape) > 1:
+            yield from cells(site.axes, all_columns(problem, site))
 
 
 def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import itertools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,6 +18,9 @@ _FINEST_OVER: Final = 64
 """Half waves of the finest ripple over a quantity of several axes or a site."""
 _OFTEN: Final = 24
 """Times that a quantity takes each of its values, on average, where each of them may be off by an amount of its own."""
+_GROUPS: Final = 32
+"""Values up to which a column makes cells with another one."""
+_MOST_PAIRS: Final = 6
 
 
 @dataclass(frozen=True)
@@ -60,7 +64,7 @@ def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | N
     """A real site or column, on the axes along which it varies; None where too few of its values differ."""
     if not np.issubdtype(values.dtype, np.floating) or not np.isfinite(values).all():
         return None
-    wide = [i for i, n in enumerate(values.shape) if n > 1 and (values != values.take([0], i)).any()]
+    wide = _varies(values)
     values = values[tuple(slice(None) if i in wide else 0 for i in range(values.ndim))]
     if len(np.unique(values)) < SMOOTH_FROM:
         return None
@@ -84,3 +88,27 @@ def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quant
     if last > 1:
         _, rows = np.unique(values.reshape(-1, last), axis=0, return_inverse=True)
         yield Quantity(f"{name} of all", tuple(axes[:-1]), rows.reshape(values.shape[:-1]), ordered=False)
+
+
+def cells(axes: Sequence[str], columns: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
+    """What two columns of few values tell apart together, as channels at noon, but for two along the same single axis.
+
+    Args:
+        axes: of an observed site.
+        columns: of the data, of the site's shape.
+    """
+    made = {name: np.unique(column, return_inverse=True)[1] for name, column in columns.items()}
+    few = {name: index for name, index in made.items() if 1 <= index.max() < _GROUPS}
+    wide = {name: _varies(columns[name]) for name in few}
+    pairs = [(a, b) for a, b in itertools.combinations(few, 2) if wide[a] != wide[b] or len(wide[a]) > 1]
+    for one, other in pairs[:_MOST_PAIRS]:
+        _, index = np.unique(_GROUPS * few[one] + few[other], return_inverse=True)
+        if index.max() > max(few[one].max(), few[other].max()):  # else one's groups lie within the other's
+            yield Quantity(
+                f"{one} and {other}", tuple(axes), index.reshape(columns[one].shape), ordered=False
+            )
+
+
+def _varies(values: np.ndarray) -> tuple[int, ...]:
+    """Axes along which an array varies."""
+    return tuple(i for i, n in enumerate(values.shape) if n > 1 and (values != values.take([0], i)).any())

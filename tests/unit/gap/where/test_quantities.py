@@ -7,8 +7,8 @@ import pytest
 from scipy import sparse
 
 from dtprob.gap.where.curves import curves
-from dtprob.gap.where.data_columns import whole_columns
-from dtprob.gap.where.quantities import groups, quantity
+from dtprob.gap.where.data_columns import all_columns, whole_columns
+from dtprob.gap.where.quantities import cells, groups, quantity
 
 
 @pytest.fixture
@@ -118,3 +118,37 @@ def test_a_line_along_one_column_may_differ_by_another():
     for b, line in enumerate(lines):
         assert not line[band != b].any()
         assert abs(np.corrcoef(line[band == b], distance[band == b])[0, 1]) == pytest.approx(1.0)
+
+
+def test_columns_on_different_axes_make_cells_too():
+    rng = np.random.default_rng(6)
+    given = {
+        "channel": rng.integers(0, 5, (12, 30)),
+        "weekend": np.arange(12) % 7 > 4,
+        "noon": np.arange(30) % 6 == 3,
+    }
+    given |= {"morning": np.arange(30) < 9, "half": rng.uniform(size=(12, 30))}
+    site = SimpleNamespace(axes=("day", "slot"), shape=(12, 30))
+    problem = SimpleNamespace(
+        data=given,
+        observed=SimpleNamespace(arguments=frozenset()),
+        declaration=SimpleNamespace(observed={"y": site}),
+    )
+    on_both = all_columns(problem, site)
+    assert on_both.keys() == given.keys()
+    np.testing.assert_array_equal(on_both["weekend"][:, 3], given["weekend"])
+    np.testing.assert_array_equal(on_both["noon"][3], given["noon"])
+    found = {made.name: made for made in cells(site.axes, on_both)}
+    assert found.keys() == {
+        *("channel and weekend", "channel and noon", "channel and morning"),
+        *("weekend and noon", "weekend and morning"),  # noon and morning both lie along slot alone
+    }
+    for name, of_cells in found.items():
+        one, other = name.split(" and ")
+        (by_cell,) = of_cells.curves()
+        of_each = by_cell.values.toarray().reshape(-1, 12, 30)
+        assert len(of_each) == len({*zip(on_both[one].flat, on_both[other].flat, strict=True)})
+        for cell in of_each > 0:
+            assert len({*zip(on_both[one][cell], on_both[other][cell], strict=True)}) == 1
+    within = {"channel": given["channel"], "low": given["channel"] < 2}
+    assert not list(cells(site.axes, within))
