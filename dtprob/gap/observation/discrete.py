@@ -60,6 +60,16 @@ def counts_spread(p: Parameters) -> jax.Array:
     return _counts_spread(p["concentration"], p["concentration"] / p["rate"])
 
 
+def counts_spread_about(p: Parameters) -> jax.Array:
+    """The same root in closed form: right for small and for large means, at most 1.7 times as large between them.
+
+    A unit of steps needs no more, and it is taken at each evaluation of the density of a field of steps.
+    """
+    c, mean = p["concentration"], p["concentration"] / p["rate"]
+    grown = mean * (c + 1 / 3) / (c + 2 / 3)
+    return mean / (c * jnp.sqrt(2 * (c + mean) * (c + 1 + grown)))
+
+
 @jax.custom_jvp
 def _counts_spread(concentration: jax.Array, mean: jax.Array) -> jax.Array:
     """Root of the information on the concentration c where the mean m is held.
