@@ -15,6 +15,7 @@ from dtprob.commands.progress import unread
 from dtprob.errors import InputError, Terminated, nearest
 from dtprob.reproduce import FIGURES
 from dtprob.threads import one_thread
+from dtprob.usercode import raised_at
 from dtprob.xla import avoid_miscompilation
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
@@ -178,8 +179,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except InputError as error:
         return _fail(WRONG_INPUT, str(error), debug=debug)
     except Exception as error:  # noqa: BLE001  (the one place where any failure becomes one line)
-        text = f"{command} failed: {type(error).__name__}: {str(error) or 'no message'}"
-        return _fail(FAILED, f"{text.rstrip('.')}. See where with --debug.", debug=debug)
+        text = f"{command} failed: {type(error).__name__}: {str(error) or 'no message'}".rstrip(".")
+        place = f" (in {where})" if (where := raised_at(error)) else ""
+        return _fail(FAILED, f"{text}{place}. See how it came there with --debug.", debug=debug)
     return DONE
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, cast
+from typing import Any, Final, Literal, cast
 
 import equinox as eqx
 import jax
@@ -22,6 +22,7 @@ from numpyro.distributions import constraints, distribution
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, model_name, select_arguments, split_static
 from dtprob.models.axes import axes_of, lent
+from dtprob.usercode import raised_at
 from dtprob.wrapping import unwrapped
 
 # ArviZ registers NumPyro to be loaded later. Where it was imported first, Python runs numpyro.distributions twice, and the
@@ -172,14 +173,38 @@ def metadata(function: Model) -> Metadata:
     return getattr(function, _METADATA, Metadata({}, None))
 
 
+_MISFIT: Final = "ncompatible shapes for broadcasting"
+
+
 def trace_model(
     function: Model, data: Data, key: jax.Array, substitute: Mapping[str, Any] | None = None
 ) -> dict[str, Any]:
-    """One execution of the model: the NumPyro trace, latent sites drawn from the prior unless substituted."""
+    """One execution of the model: the NumPyro trace, latent sites drawn from the prior unless substituted.
+
+    Raises:
+        InputError: arrays whose shapes do not fit, as those of data longer than their plate.
+    """
     seeded = handlers.seed(function, key)
     values = {name: jnp.asarray(value) for name, value in (substitute or {}).items()}  # a scan indexes them
-    replaced = handlers.substitute(seeded, data=values)
-    return handlers.trace(replaced).get_trace(**data)
+    traced = handlers.trace(handlers.substitute(seeded, data=values))
+    try:
+        return traced.get_trace(**data)
+    except (TypeError, ValueError) as error:
+        if _MISFIT not in str(error):
+            raise
+        raise _misfit(function, error, traced.trace) from error
+
+
+def _misfit(function: Model, error: Exception, trace: Mapping[str, Mapping[str, Any]]) -> InputError:
+    """Of shapes that do not fit, with the place in the user's code and the plates that the model had come to."""
+    plates = [
+        f"{name} of {message['args'][0]}" for name, message in trace.items() if message["type"] == "plate"
+    ]
+    sizes = f"; it has come to {', '.join(plates)}" if plates else ""
+    where = f" ({place})" if (place := raised_at(error)) else ""
+    got = str(error).split("\n", maxsplit=1)[0].rstrip(".")
+    remedy = f"Give each plate the size of its data{sizes}"
+    return InputError(f"model {model_name(function)}{where}", "arrays whose shapes fit", got, remedy)
 
 
 def declare(function: Model, data: Data, *, cluster: str | None = None) -> Declaration:

@@ -218,7 +218,7 @@ def test_a_failure_of_the_job_is_status_1(case, capsys, tmp_path):
     assert main(["fit", str(case), "--out", str(tmp_path / "out")]) == 1
     text = capsys.readouterr().err
     assert text.startswith(
-        "dtprob: fit failed: NameError: name 'undefined' is not defined. See where with --debug."
+        "dtprob: fit failed: NameError: name 'undefined' is not defined (in line_model.py, line "
     )
 
 

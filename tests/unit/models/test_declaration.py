@@ -174,3 +174,17 @@ def test_what_jax_cannot_trace_is_told_in_one_line():
 
     with pytest.raises(InputError, match=r"model branching: expected operations .* jnp.where"):
         declare(branching, {"distance": jnp.ones(5), "y": jnp.ones(5)})
+
+
+def test_a_plate_of_another_size_than_its_data_is_named_with_its_place():
+    def short(x, y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+        with numpyro.plate("row", 5):
+            numpyro.deterministic("mean", level + x)
+            numpyro.sample("y", dist.Normal(level + x, 1.0), obs=y)
+
+    expected = r"model short \(test_declaration.py, line \d+\): .*\(5,\), \(7,\).* come to row of 5\."
+    with pytest.raises(InputError, match=expected):
+        declare(short, {"x": jnp.zeros(7), "y": jnp.zeros(7)})
+    with pytest.raises(TypeError, match="unhashable"):  # what a model raises of itself is left alone
+        declare(lambda x, y=None: {x: y}[[]], {"x": jnp.zeros(7), "y": jnp.zeros(7)})
