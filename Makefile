@@ -1,7 +1,7 @@
 # The environment is .venv at the root; every target brings it up to date first (at once when nothing has changed).
 BIN := .venv/bin
 
-.PHONY: setup demo test lint bench lock
+.PHONY: setup demo test study lint bench lock
 
 setup:
 	@sh scripts/setup
@@ -9,8 +9,14 @@ setup:
 demo: setup
 	$(BIN)/dtprob demo --out out/demo
 
+PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 --durations 60 --durations-min 5
+
 test: setup
-	$(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 --durations 60 --durations-min 5
+	$(PYTEST)
+
+# Long ones that `make test` leaves out.
+study: setup
+	$(PYTEST) -m study
 
 lint: setup
 	$(BIN)/ruff check .

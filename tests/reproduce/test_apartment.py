@@ -203,9 +203,11 @@ def test_losses_are_counted_in_nats_of_a_link(measured, monkeypatch):
         return SimpleNamespace(maps={"links": links}, causes=(), verdict="NO_GAP")
 
     monkeypatch.setattr(apartment, "_diagnosed", diagnosed)
-    coarse = TWINS[0]._replace(scene={"samples": 20_000})
-    found = apartment.answer(coarse, apartment.jax.random.key(0))
-    assert found.link.tolist() == list(LINKS)
+    depth = next(twin for twin in TWINS if twin.name == "depth")
+    coarse = depth._replace(scene={"samples": 20_000, "max_depth": 1, "check_depth": 2})
+    found = apartment.answer(coarse, apartment.jax.random.key(0), alone=True)
+    assert set(found.link.tolist()) < set(LINKS)
+    assert len(found.link) > 10
     assert np.allclose(found.before, 63 * 2.0)
     assert np.allclose(found.after, found.before)  # nothing is named
 

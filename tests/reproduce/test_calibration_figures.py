@@ -61,6 +61,7 @@ def test_figures_of_calibration_are_offered():
     assert {"fig5", "fig6a", "fig6b", "fig7"} <= set(FIGURES)
 
 
+@pytest.mark.study
 @pytest.mark.libllvm
 def test_displaced_receivers_traced_afresh_see_what_images_say(street_corner):
     """Over half a wavelength the list of paths, their gains and directions hardly change; their phases do."""

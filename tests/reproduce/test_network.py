@@ -56,6 +56,7 @@ def test_points_are_the_textbooks():
     assert np.all(np.abs(drawn.mean(axis=0) - mean) < error)
 
 
+@pytest.mark.study
 def test_the_figure_in_small(tmp_path):
     campaign = Campaign(COMA(), Budget(640, 8, 20), starts=0)
     with jax.enable_x64(False):  # as `run` does; one part asks for double precision

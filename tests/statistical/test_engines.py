@@ -55,9 +55,12 @@ ENGINES = {
     "nuts, custom": (NUTS(**SHORT), 60),
     "blackjax_nuts, phase_error_channel": (BlackJAXNUTS(**SHORT), 30),
 }
+LONG = {"exact, multi_access", "blackjax_nuts, phase_error_channel", "nuts, circular"}
 
 
-@pytest.mark.parametrize("name", ENGINES)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.study) if name in LONG else name for name in ENGINES]
+)
 def test_ranks_are_uniform(name):
     """Ranks of true values are even (simulated null) and 90% intervals hold them (exact), at the declared rate."""
     engine, runs = ENGINES[name]

@@ -208,6 +208,7 @@ def beside_a_field():
     return np.array(z), np.array(site)
 
 
+@pytest.mark.study
 def test_scores_beside_a_random_field_are_standard_normal(beside_a_field):
     """Mean and variance within a chance of 1 in 1,000, estimating the field's size apart."""
     z, _ = beside_a_field
@@ -247,6 +248,7 @@ def levels_of(column):
     )
 
 
+@pytest.mark.study
 def test_more_replicates_decide_where_energies_are_skew():
     """A first look at 19 replicates rings in 15% of right twins; with 20 times more ones in less than 8%."""
     rng, load = np.random.default_rng(0), np.linspace(0.0, 1.0, WAITS)

@@ -54,7 +54,7 @@ def look(data, seed):
     return search(problem, fit_base(problem, key), key, SETTINGS, print).steps
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
 def test_a_first_choice_made_for_two_effects_is_taken_back(seed):
     steps = look(rows(seed, shift=lambda x: 0.9 * np.sin(3 * x) + 0.6 * np.sin(5 * x)), seed)
     assert steps[0].accepted == "both"
@@ -98,7 +98,7 @@ LOUDER = (
 )
 
 
-@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
 def test_a_family_that_says_the_same_in_another_form_takes_nothing_back(seed):
     """Four deviations by two effects or by the site: the likelihood is one, but the effects' priors are narrower."""
     data = rows(seed, spread=lambda street: np.exp(np.array([0.5, 0.7, 0.9, 1.1]))[street % 4])

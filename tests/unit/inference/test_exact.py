@@ -61,6 +61,7 @@ def test_evidence_is_the_chain_rule_of_predictions():
     assert evidence == pytest.approx(np.log((0.5 / 1.5) * (0.5 / 2.5) * (1.5 / 3.5) * (1.5 / 4.5)), rel=1e-6)
 
 
+@pytest.mark.study
 def test_agrees_with_nuts():
     rng = np.random.default_rng(0)
     columns = {"a": rng.integers(0, 2, (1, 40)), "b": rng.integers(0, 3, (1, 40))}

@@ -109,6 +109,7 @@ def test_arguments_of_another_path_set_are_named(paths, statistics):
     assert jax.tree.leaves(without)
 
 
+@pytest.mark.study
 def test_members_of_an_ensemble_weigh_what_is_left_of_a_link_too(paths):
     """Noise that differs from link to link is as uncertain on compressed data as on the whole channel."""
     tones = jnp.linspace(-40e6, 40e6, 16)

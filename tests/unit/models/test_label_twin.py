@@ -102,6 +102,7 @@ def test_how_the_predictor_errs_is_named(name):
     assert found.causes[0].closed_fraction.mean > 0.5
 
 
+@pytest.mark.study
 def test_a_map_out_of_date_does_not_stand_in_for_a_wrong_slope():
     """A field over places can follow a slope that the candidates lack; one curve of the prediction does so better."""
     data = rows(wrong=WRONG["scale_bias"])
@@ -114,7 +115,7 @@ def test_a_map_out_of_date_does_not_stand_in_for_a_wrong_slope():
     assert found.sections["unlisted"]["sites"][0] == "predicted_label"
 
 
-@pytest.mark.parametrize("family", ["label_noise", "regional_bias"])
+@pytest.mark.parametrize("family", ["regional_bias", pytest.param("label_noise", marks=pytest.mark.study)])
 def test_a_region_is_found_whose_edge_is_not_at_a_third(family):
     """Were the edge fixed, the labels between it and the third would look like an effect of its own."""
     data = rows(n=600, error=0.3)
@@ -204,6 +205,7 @@ def test_a_case(tmp_path):
     assert "regional_bias[x2_high]" in {effect.name for effect in job.effects}
 
 
+@pytest.mark.study
 def test_several_effects_do_not_stand_in_for_a_floor():
     """Readings below a floor come out at it: regions together follow that, one curve of the prediction better."""
     data = rows(n=240)

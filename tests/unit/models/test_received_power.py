@@ -60,6 +60,7 @@ def test_moments_are_those_of_random_phases():
     np.testing.assert_allclose(trace["fading_deviation"]["value"], expected, rtol=0.03)
 
 
+@pytest.mark.study
 def test_level_and_spread_are_recovered(street):
     power = jnp.asarray(drawn(street, gains_of(street), looks=1000, spread=0.3))
     data = {"paths": street, "power": power, "materials": "known"}
@@ -77,6 +78,7 @@ def test_effects_that_need_phases_are_not_offered(street):
     assert not {"timing_offset", "phase_error", "iq_imbalance", "diffuse_scattering"} & offered
 
 
+@pytest.mark.study
 def test_a_class_of_paths_that_is_weaker_is_named(street):
     """The line of sight lost 80% of its amplitude behind something that the scene lacks."""
     gains = gains_of(street)

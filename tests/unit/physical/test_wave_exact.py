@@ -110,6 +110,7 @@ def test_the_absorbing_layer_reflects_less_than_90_db():
     assert 20 * np.log10(echo.max()) < -90
 
 
+@pytest.mark.study
 def test_beamz_sees_the_same_field():
     """An independent simulation (plain Yee scheme) of a wall and a metal block, at 94 places."""
     import beamz

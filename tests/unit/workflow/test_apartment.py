@@ -61,6 +61,7 @@ def test_the_case_binds_data_and_floor_plan(prepared):
     assert np.all((level > -82) & (level < -78))
 
 
+@pytest.mark.study
 @pytest.mark.measured
 @pytest.mark.libllvm
 def test_a_reduced_diagnosis_finds_a_gap(prepared):

@@ -59,6 +59,7 @@ def test_a_fit_is_summarised(folder):
     np.testing.assert_allclose(arrival, [0.6, 0.0, 0.4, 0.0], atol=0.15)
 
 
+@pytest.mark.study
 def test_a_disconnected_device_is_named(folder):
     prepared = prepare(case(folder), need="diagnosis")
     reference = prepared.engine(jax.random.key(1), prepared.model, prepared.reference)

@@ -130,7 +130,7 @@ def test_a_volume_is_what_its_derivatives_say():
     np.testing.assert_allclose(volume.bend, np.tile(bend, (20, 1, 1)), atol=0.02)
 
 
-@pytest.mark.parametrize("drop", [0.0, 2.0])
+@pytest.mark.parametrize("drop", [0.0, pytest.param(2.0, marks=pytest.mark.study)])
 def test_a_state_for_every_reading_is_no_gap(drop):
     """The joint mode lets the noise vanish, and all that is random would look like a gap."""
     told = []
@@ -152,6 +152,7 @@ def test_a_state_for_every_reading_is_no_gap(drop):
         assert found.verdict == "NO_GAP"
 
 
+@pytest.mark.study
 def test_what_no_candidate_explains_is_seen_at_its_site_beside_many_states():
     """States that are free at each reading could follow it: their spread must not take it with it."""
     found = diagnose(

@@ -155,6 +155,7 @@ def test_what_levels_take_is_taken_from_the_site_that_they_act_on():
     assert found.verdict == "NO_GAP"
 
 
+@pytest.mark.study
 def test_scores_beside_levels_have_the_spread_that_they_claim():
     """z of a candidate over data sets without it, with two readings of each level."""
     z = []
@@ -258,7 +259,9 @@ def test_what_is_lost_is_the_slope_of_the_curvature_of_own_unknowns(law):
     assert (rows[is_location] == 0).all()
 
 
-@pytest.mark.parametrize("law", ["Gamma", "Poisson", "Normal"])
+@pytest.mark.parametrize(
+    "law", ["Normal", *(pytest.param(law, marks=pytest.mark.study) for law in ("Gamma", "Poisson"))]
+)
 def test_scores_beside_levels_within_an_exponential_have_mean_zero(law):
     """z of a candidate that adds to the site, and of the site itself, over data sets without it."""
     z, p = [], []

@@ -145,6 +145,7 @@ def weeks(seed, db):
     return {"busy": jnp.asarray(busy), "y": jnp.asarray(y + db * busy)}
 
 
+@pytest.mark.study
 def test_noise_does_not_vanish_beside_states():
     problem = Problem(trends, weeks(10, -1.1), [BUSY], "cell")
     live, before, found = refitted(problem, BUSY)

@@ -45,6 +45,7 @@ def test_it_is_nothing_on_average_and_as_uncertain_as_it_says(spread):
     assert 0.4 < values.var() / variances.mean() < 2.5
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("spread", [0.05, 1.0])
 def test_an_effect_that_does_what_a_known_parameter_does_closes_no_gap_by_chance(spread):
     """At most 1 in 20 establish one; of 30 more than 6 would with probability 6e-4."""

@@ -72,6 +72,7 @@ def test_a_random_field_tells_no_place(found):
     assert found([jitter()], 0.5 * AT) == ()
 
 
+@pytest.mark.study
 def test_links_where_the_cause_does_nothing_are_hardly_ever_called(found):
     """Four links are said to be raised, three are; bound for 40 data sets at 1%, missed once in a thousand times."""
     shift = AT.copy()

@@ -98,7 +98,7 @@ def test_one_misplaced_receiver_is_found_and_no_other_is_moved():
     np.testing.assert_allclose(refitted(problem, base, found), moved, atol=0.02)
 
 
-@pytest.mark.parametrize("synchronised", [True, False])
+@pytest.mark.parametrize("synchronised", [True, pytest.param(False, marks=pytest.mark.study)])
 def test_receivers_that_all_stand_wavelengths_away_are_found(synchronised):
     moved = np.random.default_rng(1).normal(0.0, 0.1, (14, 2))
     problem, base = received(moved, synchronised)
@@ -106,7 +106,7 @@ def test_receivers_that_all_stand_wavelengths_away_are_found(synchronised):
     np.testing.assert_allclose(refitted(problem, base, found), moved, atol=0.02)
 
 
-@pytest.mark.parametrize("synchronised", [True, False])
+@pytest.mark.parametrize("synchronised", [True, pytest.param(False, marks=pytest.mark.study)])
 @pytest.mark.parametrize(("effect", "touched"), [(ALL, 14), (FIRST, 6)])
 def test_what_several_receivers_share_is_found_in_place_of_a_field(effect, touched, synchronised):
     moved = np.zeros((14, 2))

@@ -171,6 +171,7 @@ def test_a_random_field_with_a_place_imitates_nothing(looked):
     assert not any("imitated" in line for line in said)
 
 
+@pytest.mark.study
 def test_a_random_field_is_not_found_where_there_is_none(looked):
     """The smallest of 40 p-values at the best place is no smaller than chance lets it be, one time in a thousand."""
     of = Problem(line, draw("line"), [gusty()])
