@@ -63,6 +63,7 @@ class Curves:
         values: (weight, position).
         ripple: of a band of ripples, what they are along.
         column: of groups of positions, the column of the data that makes them.
+        plain: whether they follow a column, which the user knows by name, and not positions alone.
         overlaps: whether they tell the same many times over: their largest score says where, but their sum says nothing.
         places: where each of them lies, in words, of those that lie somewhere.
     """
@@ -71,6 +72,7 @@ class Curves:
     values: np.ndarray | sparse.csr_matrix
     ripple: Ripple | None = None
     column: str | None = None
+    plain: bool = False
     overlaps: bool = False
     places: tuple[str, ...] = ()
 
@@ -108,7 +110,8 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
         if _is_ordered(column):
             yield from over_column(name, column, _FINEST if len(found) <= _FEW else _COARSE)
         if _makes_groups(column):
-            yield Curves(f"by {name}", grouped(np.unique(column, return_inverse=True)[1]), column=name)
+            groups = grouped(np.unique(column, return_inverse=True)[1])
+            yield Curves(f"by {name}", groups, column=name, plain=True)
     yield from _pairs(found, size)
 
 
@@ -137,7 +140,8 @@ def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
         yield _neighbourhoods((one, other), np.stack([found[one], found[other]], axis=1).astype(float))
     crossed = [(one, other) for one, other in itertools.product(smooth, made) if one != other]
     for one, other in crossed[:_MOST_PAIRS]:
-        yield Curves(f"along {one} by {other}", grouped(made[other]).multiply(_line(found[one])).tocsr())
+        lines = grouped(made[other]).multiply(_line(found[one])).tocsr()
+        yield Curves(f"along {one} by {other}", lines, plain=True)
     yield from itertools.islice(_cells(made, size), _MOST_PAIRS)
 
 
@@ -162,7 +166,7 @@ def _cells(made: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
         cells, index = np.unique(np.stack([made[one], made[other]]), axis=1, return_inverse=True)
         nested = cells.shape[1] == max(made[one].max(), made[other].max()) + 1
         if _CELL * cells.shape[1] <= size and not nested:
-            yield Curves(f"by {one} and {other}", grouped(index.reshape(-1)))
+            yield Curves(f"by {one} and {other}", grouped(index.reshape(-1)), plain=True)
 
 
 def grouped(index: np.ndarray) -> sparse.csr_matrix:
@@ -194,7 +198,7 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
 
 def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     """Smooth over a column (size,), beyond values that part its ranks into equal shares, and ripples over them."""
-    yield Curves(f"along {name}", _smooth(column))
+    yield Curves(f"along {name}", _smooth(column), plain=True)
     cuts = np.unique(np.quantile(column, np.arange(1, _SHARES) / _SHARES))
     steps = np.where(column > cuts[:, None], 0.5, -0.5)
     places = tuple(f"beyond {cut:.4g} of {name}" for cut in cuts)

@@ -55,7 +55,7 @@ class Quantity:
             return
         distinct, index = np.unique(flat, return_inverse=True)
         if _OFTEN * len(distinct) <= flat.size:
-            yield Curves(f"by value of {self.name}", grouped(index))
+            yield Curves(f"by value of {self.name}", grouped(index), plain=True)
         if self.ordered:
             yield from over_column(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
 

@@ -17,7 +17,8 @@ _MOST_WEIGHTS: Final = 4096
 """Suspects of a site that are kept, and weights that one of them may have."""
 _NEARLY: Final = 0.8
 _FEW: Final = 16
-"""Share of the surest family's log p-value that another one has at least where it may be named instead, and its weights."""
+"""Share of the surest family's log p-value, and of its evidence, that another one has at least where it may be named
+instead; and its weights where curves overlap."""
 _FARTHEST: Final = 1e-20
 """p-value below which all are as sure: replicates give a few weights a longer tail than hundreds."""
 
@@ -59,16 +60,21 @@ def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
 
 
 def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
-    """The surest of a site's families; of curves that overlap, or of few weights and nearly as sure, the most evident.
+    """The surest of a site's families, or one that says it in plainer words and is nearly as sure and as evident.
 
-    Curves that overlap are tested together: what varies along another column shows in many of them.
+    Curves that overlap are tested together: what varies along another column shows in many of them, so that the most
+    evident of them and of the families of few weights is named. What varies over positions (a ripple, a cycle, each
+    position by itself) is told by the column that it follows, where there is one.
     """
-    if not _overlaps(surest.family.pattern):
-        return surest
-    most = _NEARLY * np.log(max(surest.p_value, _FARTHEST))
+    pattern, most = surest.family.pattern, _NEARLY * np.log(max(surest.p_value, _FARTHEST))
     alike = [t for t in tests if t.family.kind == surest.family.kind and np.log(t.p_value) <= most]
-    few = [t for t in alike if len(t.variance) <= _FEW or _overlaps(t.family.pattern)]
-    return max(few, key=_evidence)
+    if _overlaps(pattern):
+        few = [t for t in alike if len(t.variance) <= _FEW or _overlaps(t.family.pattern)]
+        return max(few, key=_evidence)
+    if pattern.kept and not _is_plain(pattern):
+        plain = max((t for t in alike if _is_plain(t.family.pattern)), key=_evidence, default=surest)
+        return plain if _evidence(plain) >= _NEARLY * _evidence(surest) else surest
+    return surest
 
 
 def _evidence(test: FamilyTest) -> float:
@@ -80,6 +86,11 @@ def _evidence(test: FamilyTest) -> float:
     places = [slice(start, start + each) for start in range(0, size, each)]
     best = max(common_spread(test.first[0][place], test.variance[place])[1] for place in places)
     return best - float(np.log(len(places)))
+
+
+def _is_plain(pattern: Pattern) -> bool:
+    """Whether a pattern follows a column."""
+    return pattern.curves is not None and pattern.curves.plain
 
 
 def _overlaps(pattern: Pattern) -> bool:
