@@ -34,7 +34,7 @@ from dtprob.gap.which.trials import Say, credit
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import resolve
 from dtprob.inference.posterior import Posterior
-from dtprob.models.arguments import Data, Model
+from dtprob.models.arguments import Data, Model, taking
 from dtprob.models.indices import check_indices
 from dtprob.models.support import check_support
 from dtprob.models.supported import differentiated_forwards
@@ -66,7 +66,8 @@ def diagnose(
             whether and where there is a gap.
         key: typed JAX key; the verdict does not depend on it beyond the declared error rates.
         engine: the engine that confirms the accepted causes and gives their sizes, or its name.
-        cluster: axis or data column whose values are independent of one another; by default the model's own.
+        cluster: axis, or column of the data (of the model's arguments or not), whose values are independent of one another;
+            by default the model's own.
         settings: levels and effort.
         reference: posterior of the model on earlier data; it becomes the prior of the nuisances, so that a change of a
             parameter is a gap and not absorbed by a new fit.
@@ -81,6 +82,7 @@ def diagnose(
             that does not fit, or one that meets the data exactly.
     """
     engine = resolve(engine) if isinstance(engine, str) else engine
+    model = taking(model, data, cluster)
     check_indices(model, data)
     check_support(model, data)
     problem = Problem(model, data, effects, cluster, reference)

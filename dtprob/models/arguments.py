@@ -24,20 +24,44 @@ _NUMBERS: Final = "biufc"
 
 def model_name(function: Model) -> str:
     """The model's name in reports and files."""
+    function = _whole(function)
+    return getattr(function, "__name__", type(function).__name__)
+
+
+def _whole(function: Model) -> Model:
+    """The function of which a partial one holds some arguments; it has the name and the metadata."""
     while isinstance(function, functools.partial):
         function = function.func
-    return getattr(function, "__name__", type(function).__name__)
+    return function
 
 
 def within(model: Model, handler: Callable[[], AbstractContextManager[Any]]) -> Model:
     """The model, of the same arguments, each run of it under a handler of its own."""
 
-    @functools.wraps(model)
+    @functools.wraps(_whole(model))
     def run(*args: Any, **given: Any) -> Any:
         with handler():
             return model(*args, **given)
 
     run.__signature__ = inspect.signature(model)  # pyright: ignore[reportAttributeAccessIssue]
+    return run
+
+
+def taking(model: Model, data: Data, column: str | None) -> Model:
+    """The model, which also takes a column of the data and leaves it alone, as the one whose values name clusters."""
+    signature = inspect.signature(model)
+    taken = signature.parameters.values()
+    if column is None or column not in data or column in signature.parameters:
+        return model
+    if any(p.kind is p.VAR_KEYWORD for p in taken):
+        return model
+
+    @functools.wraps(_whole(model))
+    def run(*args: Any, **given: Any) -> Any:
+        return model(*args, **{name: value for name, value in given.items() if name != column})
+
+    more = inspect.Parameter(column, inspect.Parameter.KEYWORD_ONLY, default=None)
+    run.__signature__ = signature.replace(parameters=[*taken, more])  # pyright: ignore[reportAttributeAccessIssue]
     return run
 
 

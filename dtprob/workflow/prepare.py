@@ -20,7 +20,7 @@ from dtprob.errors import InputError, unknown_name
 from dtprob.files import sha256
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
-from dtprob.models.arguments import Model
+from dtprob.models.arguments import Model, taking
 from dtprob.models.declaration import declare
 from dtprob.usercode import load_object, source_files
 from dtprob.workflow.columns import check_columns
@@ -101,6 +101,7 @@ def prepare(
     model = _model(case)
     say(f"reading {case.data.file.name}")
     arguments = _arguments(case, model, case.data.file, cache, say)
+    model = taking(model, arguments, case.data.cluster)
     reference, designs, effects = None, {}, ()
     if need == "diagnosis":
         if case.data.reference is not None:
@@ -191,7 +192,7 @@ def _arguments(
     own = [] if arrange is None else list(inspect.signature(arrange).parameters)[1:]
     arguments |= _options(case, takes, arguments, own)
     if observed and case.model.name not in MODELS:
-        check_columns(file, model, arguments, columns)
+        check_columns(file, taking(model, arguments, case.data.cluster), arguments, columns)
     return arguments
 
 
