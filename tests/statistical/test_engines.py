@@ -55,7 +55,13 @@ ENGINES = {
     "nuts, custom": (NUTS(**SHORT), 60),
     "blackjax_nuts, phase_error_channel": (BlackJAXNUTS(**SHORT), 30),
 }
-LONG = {"exact, multi_access", "blackjax_nuts, phase_error_channel", "nuts, circular"}
+LONG = {
+    "exact, multi_access",
+    "blackjax_nuts, phase_error_channel",
+    "nuts, circular",
+    "smc, circular",
+    "svi, normal",
+}
 
 
 @pytest.mark.parametrize(

@@ -173,6 +173,7 @@ def test_random_levels_are_a_variance_effect():
     )  # twelve draws can be far from the 0.8 that they are of
 
 
+@pytest.mark.study
 def test_counts_and_turned_tones_are_diagnosed_too():
     found = run(counts, draw("counts", shift=0.25 * inputs() ** 2), (bend(), ripple()))
     assert (found.verdict, found.causes[0].effects) == ("LISTED", ("bend",))

@@ -171,6 +171,7 @@ def test_a_second_look_at_the_sites_is_of_new_replicates(problem):
     assert not alike.all(axis=(2, 3)).any()
 
 
+@pytest.mark.study
 def test_false_alarms_and_power_over_many_data_sets(problem):
     settings = Settings(replicates=60, site_replicates=60)
     n, level, strong = 100, 0.1, 5

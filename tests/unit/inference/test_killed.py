@@ -42,6 +42,7 @@ RUNS = {
     "von_mises_em": VonMisesEM(draws=20),
     "ensemble": Ensemble(members=4, base="laplace", settings={"draws": 5, "starts": 1}),
 }
+ALIKE = {"blackjax_nuts", "hmc"}  # run by the same loop as nuts
 
 
 def run(name, **options):
@@ -55,7 +56,9 @@ def test_every_engine_that_iterates_is_here():
     assert set(RUNS) == set(ENGINES) - AT_ONCE
 
 
-@pytest.mark.parametrize("name", RUNS)
+@pytest.mark.parametrize(
+    "name", [pytest.param(name, marks=pytest.mark.study) if name in ALIKE else name for name in RUNS]
+)
 def test_killed_and_resumed_ends_with_the_same_bits(name, tmp_path):
     path = tmp_path / "run.h5"
     process = subprocess.run(

@@ -120,7 +120,7 @@ def test_standard_units_leave_the_density_as_it_is(data):
     assert decentred(sensors, data, ["slope"]) is sensors
 
 
-@pytest.mark.parametrize("cluster", ["site", "day"])
+@pytest.mark.parametrize("cluster", ["day", pytest.param("site", marks=pytest.mark.study)])
 def test_a_cause_beside_levels_is_told(data, cluster):
     bent = {**data, "y": data["y"] + 0.4 * (data["x"] ** 2 - 1)}
     for given, verdict in ((data, "NO_GAP"), (bent, "LISTED")):
@@ -213,7 +213,9 @@ def test_other_control_flow_is_left_as_it_is():
     assert site["sign"]["value"] == 1.0
 
 
-@pytest.mark.parametrize("kind", ["walk", "curve", "state"])
+@pytest.mark.parametrize(
+    "kind", ["state", *(pytest.param(kind, marks=pytest.mark.study) for kind in ("walk", "curve"))]
+)
 def test_what_all_clusters_share_of_a_series_is_no_gap(kind):
     """Its joint mode with the spread would be a flat line, and every hour wrong."""
     found = diagnose(

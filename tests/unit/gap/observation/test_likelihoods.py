@@ -70,7 +70,7 @@ def idle(level):
 
 OBSERVED = {"received": received, "faded": faded, "shadowed": shadowed, "bursty": bursty, "turned": turned}
 OBSERVED |= {"floored": floored, "hidden": hidden, "idle": idle}
-SLOW = {"bursty", "hidden", "idle"}  # to compile
+SLOW = {"bursty", "hidden", "idle", "floored", "faded"}  # to compile
 KINDS = [pytest.param(kind, marks=pytest.mark.study) if kind in SLOW else kind for kind in OBSERVED]
 
 

@@ -58,7 +58,7 @@ def test_where_p_values_end_values_with_scores_that_noise_makes_come_last(score,
     )
 
 
-@pytest.mark.parametrize("what", ["spread", "mean"])
+@pytest.mark.parametrize("what", ["mean", pytest.param("spread", marks=pytest.mark.study)])
 def test_far_off_it_is_still_told_whether_the_mean_or_its_noise_is_wrong(what):
     """Noise of ten times the deviation at a fifth of the readings, or a mean that bends by as much."""
     rng = np.random.default_rng(7)
