@@ -139,7 +139,7 @@ def _redistributed(fn: Any, suspect: Suspect, step: jax.Array, seen: jax.Array) 
     shape = fn.batch_shape + fn.event_shape
     value = seen if seen.shape == shape else jnp.full(shape, jnp.nan)
     observed = whiten.observation(fn, value, suspect.site)
-    found = whiten.moved(observed, step, spread=suspect.family.kind == "spread")
+    found = whiten.moved(observed, step, spread=suspect.family.kind == "spread", about=True)
     if found is None:
         return fn
     new = whiten.distribution(found)

@@ -26,6 +26,7 @@ class Likelihood:
         located: how many of the rows, the first ones, stand for a location or probability; None for all.
         relocate: (parameters, step) -> parameters whose first row is shifted by the step; None where that is not possible.
         respread: the same for the first row that is no location.
+        respread_about: the same by about the step, where the exact unit is slow to tell.
         log_scale: of families whose first rows are normal, the logarithm of the scale for a unit step of that row.
         probability: (parameters, first row) -> probability of a smaller value, of families that are neither normal nor
             discrete and whose first row grows with the value.
@@ -45,6 +46,7 @@ class Likelihood:
     located: int | None = None
     relocate: Move | None = None
     respread: Move | None = None
+    respread_about: Move | None = None
     log_scale: float | None = None
     probability: Rows | None = None
     is_outcome: bool = False

@@ -173,7 +173,8 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         relocate=moves.grown(
             "rate", lambda p: -discrete.counts_deviation(p) * p["rate"] / p["concentration"]
         ),
-        respread=moves.at_same_mean(discrete.counts_spread_about),
+        respread=moves.at_same_mean(discrete.counts_spread),
+        respread_about=moves.at_same_mean(discrete.counts_spread_about),
     ),
     "Poisson": Likelihood(
         dist.Poisson,

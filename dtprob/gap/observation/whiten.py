@@ -127,8 +127,17 @@ def is_joint(family: str) -> bool:
     return likelihood(family).log_prob is not None
 
 
-def moved(observed: Observation, step: jax.Array, *, spread: bool) -> Observation | None:
-    """The observation with its location, or its spread, moved by whitened steps; None where its family has no such move."""
+def moved(observed: Observation, step: jax.Array, *, spread: bool, about: bool = False) -> Observation | None:
+    """The observation with its location, or its spread, moved by whitened steps; None where its family has no such move.
+
+    Args:
+        observed: what is observed.
+        step: of the row, one for each value.
+        spread: whether the first row that is no location is moved.
+        about: whether steps near these will do, where theirs are slow to tell.
+    """
     known = likelihood(observed.family)
     move = known.respread if spread else known.relocate
+    if about and spread and known.respread_about is not None:
+        move = known.respread_about
     return None if move is None else Observation(observed.family, move(observed.parameters, step))

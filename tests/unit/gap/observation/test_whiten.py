@@ -537,9 +537,6 @@ def test_a_move_shifts_one_row_by_its_step(family, spread):
     rows = np.asarray(whiten.shift(observed, jax.jvp(parameters, (0.0,), (1.0,))[1]))
     wanted = np.zeros_like(rows)
     wanted[whiten.location_rows(family, len(rows)) if spread else 0] = step
-    if spread and "GammaPoisson" in family:  # whose unit is in closed form, and near what it stands for
-        own = {name: observed.parameters[name] for name in ("concentration", "rate")}
-        wanted *= np.asarray(discrete.counts_spread(own) / discrete.counts_spread_about(own))
     np.testing.assert_allclose(rows, wanted, atol=1e-6)
 
 
@@ -556,6 +553,17 @@ def test_the_unit_of_steps_of_counts_is_near_the_root_of_their_information():
         (mean > 1e3 * concentration) & (concentration > 1),
     )
     np.testing.assert_allclose(ratio[few | many], 1.0, atol=0.06)
+
+
+def test_a_field_of_steps_of_counts_takes_them_in_that_unit():
+    observed = batch("GammaPoisson", draws("GammaPoisson", 1))
+    exact, about = (whiten.moved(observed, jnp.full(1, 0.3), spread=True, about=a) for a in (False, True))
+    assert exact is not None
+    assert about is not None
+    before = observed.parameters["concentration"]
+    grown = [jnp.log(after.parameters["concentration"] / before) for after in (exact, about)]
+    ratio = discrete.counts_spread_about(observed.parameters) / discrete.counts_spread(observed.parameters)
+    np.testing.assert_allclose(grown[0], grown[1] * ratio, rtol=1e-9)
 
 
 def test_nothing_tried_says_nothing():
