@@ -12,10 +12,9 @@ from typing import Any, NoReturn
 from dtprob import __version__
 from dtprob.case import load_case, read_document
 from dtprob.commands.progress import unread
-from dtprob.errors import InputError, Terminated, nearest
+from dtprob.errors import InputError, Terminated, nearest, raised_at
 from dtprob.reproduce import FIGURES
 from dtprob.threads import one_thread
-from dtprob.usercode import raised_at
 from dtprob.xla import avoid_miscompilation
 
 DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143

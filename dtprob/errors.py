@@ -1,7 +1,10 @@
 """What goes wrong, said so that the reader knows what to do next."""
 
 import difflib
+import sys
+import traceback
 from collections.abc import Iterable
+from pathlib import Path
 
 
 class DtprobError(Exception):
@@ -71,3 +74,15 @@ def _plural(kind: str) -> str:
     noun, of, rest = kind.partition(" of ")
     several = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2:-1] not in "aeiou" else f"{noun}s"
     return f"{several}{of}{rest}"
+
+
+def raised_at(error: BaseException) -> str | None:
+    """File and line where code that is neither dtprob's nor an installed package's last was when an error came."""
+    own = Path(__file__).parent
+    installed = tuple(Path(place) for place in (sys.prefix, sys.base_prefix, own))
+    found = None
+    for frame in traceback.extract_tb(error.__traceback__):
+        file = Path(frame.filename)
+        if file.is_file() and not any(file.is_relative_to(place) for place in installed):
+            found = f"{file.name}, line {frame.lineno}"
+    return found

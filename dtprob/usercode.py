@@ -3,7 +3,6 @@
 import importlib
 import importlib.util
 import sys
-import traceback
 from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
@@ -36,18 +35,6 @@ def load_object(name: str, folder: Path) -> Any:
         public = [entry for entry in vars(module) if not entry.startswith("_")]
         raise unknown_name(f"module {module_name}", attribute, public, "name")
     return getattr(module, attribute)
-
-
-def raised_at(error: BaseException) -> str | None:
-    """File and line where code that is neither dtprob's nor an installed package's last was when an error came."""
-    own = Path(__file__).parent
-    installed = tuple(Path(place) for place in (sys.prefix, sys.base_prefix, own))
-    found = None
-    for frame in traceback.extract_tb(error.__traceback__):
-        file = Path(frame.filename)
-        if file.is_file() and not any(file.is_relative_to(place) for place in installed):
-            found = f"{file.name}, line {frame.lineno}"
-    return found
 
 
 def source_files(names: Iterable[str], folder: Path) -> list[Path]:

@@ -24,11 +24,11 @@ _NUMBERS: Final = "biufc"
 
 def model_name(function: Model) -> str:
     """The model's name in reports and files."""
-    function = _whole(function)
+    function = whole(function)
     return getattr(function, "__name__", type(function).__name__)
 
 
-def _whole(function: Model) -> Model:
+def whole(function: Model) -> Model:
     """The function of which a partial one holds some arguments; it has the name and the metadata."""
     while isinstance(function, functools.partial):
         function = function.func
@@ -38,7 +38,7 @@ def _whole(function: Model) -> Model:
 def within(model: Model, handler: Callable[[], AbstractContextManager[Any]]) -> Model:
     """The model, of the same arguments, each run of it under a handler of its own."""
 
-    @functools.wraps(_whole(model))
+    @functools.wraps(whole(model))
     def run(*args: Any, **given: Any) -> Any:
         with handler():
             return model(*args, **given)
@@ -56,7 +56,7 @@ def taking(model: Model, data: Data, column: str | None) -> Model:
     if any(p.kind is p.VAR_KEYWORD for p in taken):
         return model
 
-    @functools.wraps(_whole(model))
+    @functools.wraps(whole(model))
     def run(*args: Any, **given: Any) -> Any:
         return model(*args, **{name: value for name, value in given.items() if name != column})
 

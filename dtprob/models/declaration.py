@@ -6,7 +6,6 @@ samples, computes and observes. The decorator `model` only adds names for axes t
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, Final, Literal, cast
@@ -19,10 +18,9 @@ import numpyro
 from numpyro import handlers
 from numpyro.distributions import constraints, distribution
 
-from dtprob.errors import InputError
-from dtprob.models.arguments import Data, Model, model_name, select_arguments, split_static
+from dtprob.errors import InputError, raised_at
+from dtprob.models.arguments import Data, Model, model_name, select_arguments, split_static, whole
 from dtprob.models.axes import axes_of, lent
-from dtprob.usercode import raised_at
 from dtprob.wrapping import unwrapped
 
 # ArviZ registers NumPyro to be loaded later. Where it was imported first, Python runs numpyro.distributions twice, and the
@@ -39,6 +37,8 @@ NOT_TRACED = (
 )
 """What JAX raises where a program asks for values that it does not know yet."""
 _METADATA = "__dtprob__"
+_MISFIT: Final = "ncompatible shapes for broadcasting"
+"""In what JAX says of them."""
 
 
 @dataclass(frozen=True)
@@ -168,12 +168,7 @@ def model(
 
 def metadata(function: Model) -> Metadata:
     """The metadata of a model, empty where its author gave none."""
-    while isinstance(function, functools.partial):
-        function = function.func
-    return getattr(function, _METADATA, Metadata({}, None))
-
-
-_MISFIT: Final = "ncompatible shapes for broadcasting"
+    return getattr(whole(function), _METADATA, Metadata({}, None))
 
 
 def trace_model(

@@ -30,8 +30,8 @@ _SHARES: Final = 16
 _CENTRES: Final = 64
 _NEAREST: Final = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Places in the plane of two columns about which a compact region is looked for, and shares of the positions in one."""
-_MOST_PAIRS: Final = 6
-_GROUPS: Final = 32
+MOST_PAIRS: Final = 6
+GROUPS: Final = 32
 _SHARED: Final = 8
 """Values of a real column up to which it is looked at by value too, and positions that share one of them on average."""
 _CELL: Final = 4
@@ -126,23 +126,23 @@ def _is_ordered(column: np.ndarray) -> bool:
 def _makes_groups(column: np.ndarray) -> bool:
     """Whether the values of a column (size,) may be names of groups, as numbers of receivers are among real ones too."""
     count = len(np.unique(column))
-    return not _is_ordered(column) or (count <= _GROUPS and _SHARED * count <= len(column))
+    return not _is_ordered(column) or (count <= GROUPS and _SHARED * count <= len(column))
 
 
 def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
     """What varies with two columns (size,) together: smooth over both, along one in each group, by groups of both."""
     made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}
     smooth = [n for n, c in found.items() if _is_ordered(c) and np.issubdtype(c.dtype, np.floating)]
-    for one, other in list(itertools.combinations(smooth, 2))[:_MOST_PAIRS]:
+    for one, other in list(itertools.combinations(smooth, 2))[:MOST_PAIRS]:
         first, second = (_waves(_rank(found[name]), 1, _CROSSED) for name in (one, other))
         products = first[:, None] * second[None]
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
         yield _neighbourhoods((one, other), np.stack([found[one], found[other]], axis=1).astype(float))
     crossed = [(one, other) for one, other in itertools.product(smooth, made) if one != other]
-    for one, other in crossed[:_MOST_PAIRS]:
+    for one, other in crossed[:MOST_PAIRS]:
         lines = grouped(made[other]).multiply(_line(found[one])).tocsr()
         yield Curves(f"along {one} by {other}", lines, plain=True)
-    yield from itertools.islice(_cells(made, size), _MOST_PAIRS)
+    yield from itertools.islice(_cells(made, size), MOST_PAIRS)
 
 
 def _neighbourhoods(over: tuple[str, str], place: np.ndarray) -> Curves:
@@ -161,12 +161,17 @@ def _neighbourhoods(over: tuple[str, str], place: np.ndarray) -> Curves:
 
 
 def _cells(made: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
-    """By the groups of two columns, from their group of each position (size,); not where one lies within the other."""
+    """By the groups of two columns, from their group of each position (size,)."""
     for one, other in itertools.combinations(made, 2):
-        cells, index = np.unique(np.stack([made[one], made[other]]), axis=1, return_inverse=True)
-        nested = cells.shape[1] == max(made[one].max(), made[other].max()) + 1
-        if _CELL * cells.shape[1] <= size and not nested:
-            yield Curves(f"by {one} and {other}", grouped(index.reshape(-1)), plain=True)
+        index = joined(made[one], made[other])
+        if index is not None and _CELL * (index.max() + 1) <= size:
+            yield Curves(f"by {one} and {other}", grouped(index), plain=True)
+
+
+def joined(one: np.ndarray, other: np.ndarray) -> np.ndarray | None:
+    """The group of each position by its groups of two columns; None where those of one lie within the other's."""
+    _, index = np.unique(one * (other.max() + 1) + other, return_inverse=True)
+    return None if index.max() == max(one.max(), other.max()) else index.reshape(one.shape)
 
 
 def grouped(index: np.ndarray) -> sparse.csr_matrix:

@@ -50,12 +50,12 @@ def whole_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
 
 
 def all_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
-    """Columns of the data on one axis or several of an observed site, each of its shape."""
+    """Columns of the data on one axis or several of an observed site, of size 1 along the site's other axes."""
     found = whole_columns(problem, site)
     for i, axis in enumerate(site.axes):
         beside = tuple(j for j in range(len(site.shape)) if j != i)
         for name, column in columns(problem, axis, site.shape[i]).items():
-            found.setdefault(name, np.broadcast_to(np.expand_dims(column, beside), site.shape))
+            found.setdefault(name, np.expand_dims(column, beside))
     return found
 
 

@@ -207,9 +207,10 @@ def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[
             yield found
     for name, (axes, value) in columns.items():
         yield from groups(name, axes, value)
-    for site in problem.declaration.observed.values():
-        if len(site.shape) > 1:
-            yield from cells(site.axes, all_columns(problem, site))
+    seen = {(site.axes, site.shape): site for site in problem.declaration.observed.values()}
+    for (axes, shape), site in seen.items():
+        if len(shape) > 1:
+            yield from cells(axes, shape, all_columns(problem, site))
 
 
 def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:

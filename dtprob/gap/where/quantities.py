@@ -9,7 +9,16 @@ from typing import Final
 
 import numpy as np
 
-from dtprob.gap.where.curves import ORDER, SMOOTH_FROM, Curves, grouped, over_column
+from dtprob.gap.where.curves import (
+    GROUPS,
+    MOST_PAIRS,
+    ORDER,
+    SMOOTH_FROM,
+    Curves,
+    grouped,
+    joined,
+    over_column,
+)
 from dtprob.models.axes import is_unnamed
 
 _LARGEST: Final = 1 << 18
@@ -18,9 +27,6 @@ _FINEST_OVER: Final = 64
 """Half waves of the finest ripple over a quantity of several axes or a site."""
 _OFTEN: Final = 24
 """Times that a quantity takes each of its values, on average, where each of them may be off by an amount of its own."""
-_GROUPS: Final = 32
-"""Values up to which a column makes cells with another one."""
-_MOST_PAIRS: Final = 6
 
 
 @dataclass(frozen=True)
@@ -90,23 +96,24 @@ def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quant
         yield Quantity(f"{name} of all", tuple(axes[:-1]), rows.reshape(values.shape[:-1]), ordered=False)
 
 
-def cells(axes: Sequence[str], columns: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
+def cells(
+    axes: Sequence[str], shape: tuple[int, ...], columns: Mapping[str, np.ndarray]
+) -> Iterator[Quantity]:
     """What two columns of few values tell apart together, as channels at noon, but for two along the same single axis.
 
     Args:
         axes: of an observed site.
-        columns: of the data, of the site's shape.
+        shape: of the site.
+        columns: of the data, of as many axes, of size 1 along those that a column does not lie on.
     """
-    made = {name: np.unique(column, return_inverse=True)[1] for name, column in columns.items()}
-    few = {name: index for name, index in made.items() if 1 <= index.max() < _GROUPS}
-    wide = {name: _varies(columns[name]) for name in few}
+    made = {n: np.unique(c, return_inverse=True)[1].reshape(c.shape) for n, c in columns.items()}
+    few = {name: index for name, index in made.items() if 1 <= index.max() < GROUPS}
+    wide = {name: _varies(index) for name, index in few.items()}
     pairs = [(a, b) for a, b in itertools.combinations(few, 2) if wide[a] != wide[b] or len(wide[a]) > 1]
-    for one, other in pairs[:_MOST_PAIRS]:
-        _, index = np.unique(_GROUPS * few[one] + few[other], return_inverse=True)
-        if index.max() > max(few[one].max(), few[other].max()):  # else one's groups lie within the other's
-            yield Quantity(
-                f"{one} and {other}", tuple(axes), index.reshape(columns[one].shape), ordered=False
-            )
+    for one, other in pairs[:MOST_PAIRS]:
+        index = joined(*np.broadcast_arrays(few[one], few[other]))
+        if index is not None:
+            yield Quantity(f"{one} and {other}", tuple(axes), np.broadcast_to(index, shape), ordered=False)
 
 
 def _varies(values: np.ndarray) -> tuple[int, ...]:

@@ -136,9 +136,9 @@ def test_columns_on_different_axes_make_cells_too():
     )
     on_both = all_columns(problem, site)
     assert on_both.keys() == given.keys()
-    np.testing.assert_array_equal(on_both["weekend"][:, 3], given["weekend"])
-    np.testing.assert_array_equal(on_both["noon"][3], given["noon"])
-    found = {made.name: made for made in cells(site.axes, on_both)}
+    np.testing.assert_array_equal(on_both["weekend"][:, 0], given["weekend"])
+    np.testing.assert_array_equal(on_both["noon"][0], given["noon"])
+    found = {made.name: made for made in cells(site.axes, site.shape, on_both)}
     assert found.keys() == {
         *("channel and weekend", "channel and noon", "channel and morning"),
         *("weekend and noon", "weekend and morning"),  # noon and morning both lie along slot alone
@@ -147,8 +147,9 @@ def test_columns_on_different_axes_make_cells_too():
         one, other = name.split(" and ")
         (by_cell,) = of_cells.curves()
         of_each = by_cell.values.toarray().reshape(-1, 12, 30)
-        assert len(of_each) == len({*zip(on_both[one].flat, on_both[other].flat, strict=True)})
+        here, there = (np.broadcast_to(on_both[name], site.shape) for name in (one, other))
+        assert len(of_each) == len({*zip(here.flat, there.flat, strict=True)})
         for cell in of_each > 0:
-            assert len({*zip(on_both[one][cell], on_both[other][cell], strict=True)}) == 1
+            assert len({*zip(here[cell], there[cell], strict=True)}) == 1
     within = {"channel": given["channel"], "low": given["channel"] < 2}
-    assert not list(cells(site.axes, within))
+    assert not list(cells(site.axes, site.shape, within))

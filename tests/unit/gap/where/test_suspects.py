@@ -105,8 +105,6 @@ def test_what_follows_a_column_is_told_by_it_and_not_by_positions():
     assert surest.startswith("ripple in slot")
     assert told == "additive, by hour"
     # what neither hours nor lanes follow
-    surest, told = named(
-        2.0 * np.sin(2 * np.pi * np.arange(size) / 31)
-    )  # hours follow it no better than lanes do
+    surest, told = named(2.0 * np.sin(2 * np.pi * np.arange(size) / 31))
     assert surest.startswith("ripple in slot")
     assert told == f"additive, {surest}"
