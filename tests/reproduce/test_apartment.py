@@ -191,9 +191,16 @@ def test_every_twin_can_be_traced(measured, tmp_path, twin: Twin):
 
 
 @pytest.mark.measured
-def test_losses_are_counted_in_nats_of_a_link(measured, monkeypatch):
+@pytest.mark.usefixtures("measured")
+@pytest.mark.parametrize(
+    ("name", "scene", "alone", "reached"),
+    [
+        ("depth", {"max_depth": 1, "check_depth": 2}, True, 17),
+        pytest.param("honest", {}, False, len(LINKS), marks=pytest.mark.study),
+    ],
+)
+def test_losses_are_counted_in_nats_of_a_link(name, scene, alone, reached, monkeypatch):
     """A diagnosis gives them for each observed power, above a floor."""
-    del measured
 
     def diagnosed(prepared, key, settings, say):
         del key, settings, say
@@ -203,11 +210,11 @@ def test_losses_are_counted_in_nats_of_a_link(measured, monkeypatch):
         return SimpleNamespace(maps={"links": links}, causes=(), verdict="NO_GAP")
 
     monkeypatch.setattr(apartment, "_diagnosed", diagnosed)
-    depth = next(twin for twin in TWINS if twin.name == "depth")
-    coarse = depth._replace(scene={"samples": 20_000, "max_depth": 1, "check_depth": 2})
-    found = apartment.answer(coarse, apartment.jax.random.key(0), alone=True)
-    assert set(found.link.tolist()) < set(LINKS)
-    assert len(found.link) > 10
+    twin = next(twin for twin in TWINS if twin.name == name)
+    coarse = twin._replace(scene={"samples": 20_000, **scene})
+    found = apartment.answer(coarse, apartment.jax.random.key(0), alone=alone)
+    assert [link for link in LINKS if link in found.link] == found.link.tolist()
+    assert len(found.link) == reached
     assert np.allclose(found.before, 63 * 2.0)
     assert np.allclose(found.after, found.before)  # nothing is named
 

@@ -174,7 +174,7 @@ FAMILIES = {
         for base in (dist.Normal, dist.Logistic)
     },
 }
-COUNT = 40_000
+COUNT = 100_000
 
 
 def test_every_family_is_tested():
@@ -447,9 +447,10 @@ def test_mixtures_of_a_list_of_parts():
         whiten.observation(unlike, jnp.arange(4.0), "y")
 
 
-def test_information_on_the_spread_of_counts():
+@pytest.mark.parametrize("means", [(0.05, 3.0, 400.0), pytest.param((3e5,), marks=pytest.mark.study)])
+def test_information_on_the_spread_of_counts(means):
     """Against the sum over all counts."""
-    mean, concentration = (a.ravel() for a in np.meshgrid([0.05, 3.0, 400.0, 3e4], [0.3, 5.0, 200.0]))
+    mean, concentration = (a.ravel() for a in np.meshgrid(means, [0.3, 5.0, 200.0]))
     p = {"concentration": strong(concentration), "rate": strong(concentration / mean)}
     found = np.asarray(jax.jit(discrete.counts_spread)(p)) ** 2
     for m, c, information in zip(mean, concentration, found, strict=True):
