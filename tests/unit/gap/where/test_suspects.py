@@ -108,3 +108,12 @@ def test_what_follows_a_column_is_told_by_it_and_not_by_positions():
     surest, told = named(2.0 * np.sin(2 * np.pi * np.arange(size) / 31))
     assert surest.startswith("ripple in slot")
     assert told == f"additive, {surest}"
+
+
+@pytest.mark.parametrize(("score", "is_told"), [(3.0, False), (6.0, True)])
+def test_a_column_is_named_only_where_it_is_nearly_as_evident(score, is_told, ripples):
+    """One cosine of all rows is out by 10, four lanes by 3 or by 6 each: 47 nats against some 13 or 64."""
+    lanes = Curves("by lane", np.eye(4), plain=True)
+    wave = FamilyTest(family_of(ripples.band(0, 1)), 1e-14, np.ones(9), np.full((9, 1), 10.0), np.ones(1))
+    lane = FamilyTest(family_of(lanes), 1e-13, np.ones(9), np.full((9, 4), score), np.ones(4))
+    assert plainest(wave, [wave, lane]) is (lane if is_told else wave)
