@@ -61,6 +61,9 @@ LONG = {
     "nuts, circular",
     "smc, circular",
     "svi, normal",
+    "ensemble, normal",
+    "hmc, circular",
+    "blackjax_nuts, hierarchical",
 }
 
 

@@ -95,14 +95,14 @@ def run(model, data, effects=EFFECTS, key=0, engine=None, **options):
     return diagnose(model, data, effects, key=jax.random.key(key), engine=engine or Started(), **options)
 
 
-@pytest.mark.parametrize("seed", range(1, 5))
+@pytest.mark.parametrize("seed", [1, 2, *(pytest.param(seed, marks=pytest.mark.study) for seed in (3, 4))])
 def test_no_gap_where_there_is_none(seed):
     found = run(line, draw("line", seed=seed), key=seed)
     assert found.verdict == "NO_GAP"
     assert found.causes == ()
 
 
-@pytest.mark.parametrize("seed", [0, 1, *(pytest.param(seed, marks=pytest.mark.study) for seed in (2, 3))])
+@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.study) for seed in (1, 2, 3))])
 def test_the_true_effect_is_listed(seed):
     found = run(line, draw("line", seed=10 + seed, shift=0.5 * inputs() ** 2), key=seed)
     assert found.verdict == "LISTED"

@@ -368,7 +368,9 @@ def test_doctor(capsys, monkeypatch, tmp_path):
     assert "missing  trace scenes on the CPU" in capsys.readouterr().out
 
 
-@pytest.mark.parametrize(("number", "status"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
+@pytest.mark.parametrize(
+    ("number", "status"), [(signal.SIGINT, 130), pytest.param(signal.SIGTERM, 143, marks=pytest.mark.study)]
+)
 def test_an_interrupted_fit_leaves_no_half_files(case, tmp_path, number, status):
     (tmp_path / "line_model.py").write_text(
         MODEL + "\nimport time\nprint('ready', flush=True)\ntime.sleep(60)\n"

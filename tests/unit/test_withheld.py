@@ -101,7 +101,9 @@ def test_resume_keeps_answers(answered):
     assert file.stat().st_mtime_ns == before
 
 
-@pytest.mark.parametrize("change", ["table", "code", "seed"])
+@pytest.mark.parametrize(
+    "change", ["code", *(pytest.param(what, marks=pytest.mark.study) for what in ("table", "seed"))]
+)
 def test_resume_keeps_no_answers_to_another_case(answered, tmp_path, change, monkeypatch):
     """Nor does a case that breaks off keep an older answer."""
     folder = tmp_path / "study"

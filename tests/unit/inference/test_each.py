@@ -27,7 +27,10 @@ SHORT = {
 }
 
 
-@pytest.mark.parametrize("engine", SHORT)
+@pytest.mark.parametrize(
+    "engine",
+    ["nuts", "laplace", *(pytest.param(name, marks=pytest.mark.study) for name in ("blackjax_nuts", "hmc"))],
+)
 def test_the_same_draws_as_alone_but_for_rounding(engine):
     """Before rounding has been amplified: chains without adaptation, a few draws."""
     sets, data = stacked()
@@ -67,6 +70,7 @@ def test_each_has_its_own_posterior(engine, tmp_path):
     np.testing.assert_array_equal(loaded.draws["level"], posterior.draws["level"])
 
 
+@pytest.mark.study
 def test_angles_are_centred_for_each_by_itself():
     data = at_the_cut_data()
     turned = np.asarray([0.0, 1.0, np.pi])

@@ -42,7 +42,7 @@ RUNS = {
     "von_mises_em": VonMisesEM(draws=20),
     "ensemble": Ensemble(members=4, base="laplace", settings={"draws": 5, "starts": 1}),
 }
-ALIKE = {"blackjax_nuts", "hmc"}  # run by the same loop as nuts
+ALIKE = {"blackjax_nuts", "hmc", "von_mises_em"}  # run by the same loops as nuts and svi
 
 
 def run(name, **options):

@@ -68,7 +68,9 @@ def test_side_by_side_is_the_same_up_to_rounding_at_first():
     np.testing.assert_allclose(together.draws["level"], apart.draws["level"], rtol=1e-6)
 
 
-@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize(
+    "engine", [NUTS, *(pytest.param(kind, marks=pytest.mark.study) for kind in (BlackJAXNUTS, HMC))]
+)
 def test_an_angle_at_the_cut_mixes(engine):
     data = at_the_cut_data()
     posterior = engine(draws=700, warmup=500)(KEY, at_the_cut, data)
@@ -106,7 +108,7 @@ def stop_after(monkeypatch, chunks):
 
 
 @pytest.mark.parametrize("engine", ENGINES)
-@pytest.mark.parametrize("chunks", [1, 2, 5])
+@pytest.mark.parametrize("chunks", [2, *(pytest.param(chunks, marks=pytest.mark.study) for chunks in (1, 5))])
 def test_an_interrupted_run_continues_as_if_nothing_had_happened(engine, chunks, tmp_path, monkeypatch):
     data = at_the_cut_data()
     whole = engine(**SHORT)(KEY, at_the_cut, data)

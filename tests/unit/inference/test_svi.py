@@ -60,7 +60,9 @@ def correlated():
     return np.linalg.inv(precision)
 
 
-@pytest.mark.parametrize("guide", ["mean_field", "low_rank", "full_rank"])
+@pytest.mark.parametrize(
+    "guide", ["mean_field", pytest.param("low_rank", marks=pytest.mark.study), "full_rank"]
+)
 def test_covariances_are_those_that_the_family_allows(guide):
     """Mean field: the variances are one over the precision's diagonal; the others hold the whole covariance."""
     posterior = SVI(guide=guide, rank=1, draws=3000)(KEY, pair, {"y": 1.0})

@@ -118,7 +118,8 @@ def test_a_map_out_of_date_does_not_stand_in_for_a_wrong_slope():
     assert found.sections["unlisted"]["sites"][0] == "predicted_label"
 
 
-@pytest.mark.parametrize("family", ["regional_bias", pytest.param("label_noise", marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("family", ["regional_bias", "label_noise"])
 def test_a_region_is_found_whose_edge_is_not_at_a_third(family):
     """Were the edge fixed, the labels between it and the third would look like an effect of its own."""
     data = rows(n=600, error=0.3)

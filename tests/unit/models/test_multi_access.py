@@ -24,7 +24,7 @@ def log():
     return simulate(60, 0)
 
 
-@pytest.mark.parametrize("traffic", ["memoryless", "markov"])
+@pytest.mark.parametrize("traffic", [pytest.param("memoryless", marks=pytest.mark.study), "markov"])
 def test_model_keeps_its_contract(log, traffic):
     check_model(multi_access, {**records(log, clusters=CLUSTERS), "traffic": traffic, "concentration": 1.0})
 

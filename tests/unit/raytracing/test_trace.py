@@ -64,8 +64,8 @@ def partners(paths, theirs):
     "setting",
     [
         ("simple_street_canyon", True, "itu"),
-        ("simple_street_canyon", False, "random"),
-        ("munich", False, "itu"),
+        pytest.param(("simple_street_canyon", False, "random"), marks=pytest.mark.study),
+        pytest.param(("munich", False, "itu"), marks=pytest.mark.study),
         ("munich", True, "random"),
     ],
 )

@@ -63,6 +63,7 @@ def test_no_pair_is_promised_below_a_null():
     assert len(best_pairs((CLOSED, OPEN), groups, information, np.abs(score), np.ones(2), price=price)) == 1
 
 
+@pytest.mark.study
 def test_the_answer_is_that_without_it(data):
     """A candidate that points the wrong way was a partner, and took up what is left."""
 

@@ -109,7 +109,9 @@ def test_scores_are_those_of_generalised_least_squares():
     np.testing.assert_allclose(projection.information(w)[0], information, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("links", "readings", "few"), [(400, 5, 0), (300, 10, 150)])
+@pytest.mark.parametrize(
+    ("links", "readings", "few"), [(400, 5, 0), pytest.param(300, 10, 150, marks=pytest.mark.study)]
+)
 def test_many_small_clusters_ring_no_alarm(links, readings, few):
     which = np.arange(links) < links // 2
     data = drawn(links, readings, 7, range(few))

@@ -37,7 +37,8 @@ def drawn(spread, count):
         yield problem, fit(problem, problem.null())
 
 
-@pytest.mark.parametrize("spread", [1.0, pytest.param(0.05, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("spread", [1.0, 0.05])
 def test_it_is_nothing_on_average_and_as_uncertain_as_it_says(spread):
     found = [on_earlier_data(problem, fitted) for problem, fitted in drawn(spread, COUNT)]
     values, variances = np.array(found).T

@@ -238,7 +238,8 @@ def outliers(load, hour, room, y=None):
         numpyro.sample("y", dist.Normal(mean, noise), obs=y)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [0, 1])
 def test_levels_with_outliers_are_no_gap(seed):
     """Far ones are not at the curvature of their prior: both kinds rang alarms of p 1e-8 and less."""
     rng = np.random.default_rng(seed)

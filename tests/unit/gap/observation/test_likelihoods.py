@@ -140,7 +140,9 @@ def found(kind, loss, seed):
     )
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind", [pytest.param(kind, marks=pytest.mark.study) if kind != "turned" else kind for kind in OBSERVED]
+)
 def test_a_wall_is_named_and_its_loss_is_right(kind):
     said = found(kind, 2.0, seed=6)
     assert said.verdict == "LISTED"

@@ -88,7 +88,7 @@ def replicated(noise, seed=3):
     [
         (coloured, "dependence along subcarrier"),
         (coupled, "dependence from antenna to antenna"),
-        (heavy, "spread"),  # of single entries, and tails
+        pytest.param(heavy, "spread", marks=pytest.mark.study),  # of single entries, and tails
         (imbalanced, "circularity"),
     ],
 )

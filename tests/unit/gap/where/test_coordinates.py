@@ -96,10 +96,8 @@ READINGS = {
 }
 
 
-@pytest.mark.parametrize(
-    "kind",
-    ["outcomes", *(pytest.param(kind, marks=pytest.mark.study) for kind in READINGS if kind != "outcomes")],
-)
+@pytest.mark.study
+@pytest.mark.parametrize("kind", READINGS)
 def test_no_block_of_a_right_twin_stands_out_more_often_than_it_is_said(kind):
     """100 data sets of 200 rows, against 99 replicates each, at 1%; bound missed once in a thousand times."""
     rng = np.random.default_rng(4)

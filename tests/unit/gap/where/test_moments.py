@@ -115,11 +115,11 @@ def recurring(seed):
     ("noise", "site", "expected"),
     [
         (echoed, "y", "dependence on those 3 before along time"),
-        (recurring, "y", "dependence on those 2 before along time"),
+        pytest.param(recurring, "y", "dependence on those 2 before along time", marks=pytest.mark.study),
         (skewed, "y", "skewness"),
         (heavy, "z", "spread"),  # of single entries, and tails
         (remembered, "y", "dependence along time"),
-        (across, "z", "dependence from output to output"),
+        pytest.param(across, "z", "dependence from output to output", marks=pytest.mark.study),
         (shared, "y", "dependence on z"),
     ],
 )
@@ -150,7 +150,9 @@ def test_nothing_is_noticed_where_nothing_is_wrong():
     assert min(found) > 1e-5
 
 
-@pytest.mark.parametrize(("rate", "links"), [(0.02, 6), (0.1, 6), (0.1, 60)])
+@pytest.mark.parametrize(
+    ("rate", "links"), [(0.02, 6), *(pytest.param(0.1, links, marks=pytest.mark.study) for links in (6, 60))]
+)
 def test_rare_outcomes_that_nothing_ties_together_go_by_no_later_one(rate, links):
     """With the 99 replicates of a first look; where coincidences are too few they are not looked at."""
     rng, found = np.random.default_rng(5), []

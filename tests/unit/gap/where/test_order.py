@@ -27,7 +27,8 @@ def path_loss(length, seen=None):
         numpyro.sample("reading", dist.Normal(power, 2.0), obs=seen)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_site_that_acts_through_another_alone_comes_after_it(seed):
     rng = np.random.default_rng(seed)
     length = rng.uniform(10.0, 400.0, (20, 10))
@@ -58,7 +59,8 @@ def test_where_p_values_end_values_with_scores_that_noise_makes_come_last(score,
     )
 
 
-@pytest.mark.parametrize("what", ["mean", pytest.param("spread", marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("what", ["mean", "spread"])
 def test_far_off_it_is_still_told_whether_the_mean_or_its_noise_is_wrong(what):
     """Noise of ten times the deviation at a fifth of the readings, or a mean that bends by as much."""
     rng = np.random.default_rng(7)

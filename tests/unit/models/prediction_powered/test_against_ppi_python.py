@@ -44,7 +44,7 @@ def test_mean(rival, lam):
 
 
 @pytest.mark.parametrize("loss", ["ols", "logistic", "poisson"])
-@pytest.mark.parametrize("lam", [None, 1.0])
+@pytest.mark.parametrize("lam", [None, pytest.param(1.0, marks=pytest.mark.study)])
 def test_regression(rival, loss, lam):
     sample = one_predictor(linear(n=120, kind=loss))
     practice = ESTIMATES if loss == "ols" else PUBLISHED
