@@ -123,6 +123,12 @@ def _is_ordered(column: np.ndarray) -> bool:
     return 2 * count > len(column)
 
 
+def _is_rising(column: np.ndarray) -> bool:
+    """Whether a column (size,) counts something that passes from position to position, as days do in a log."""
+    is_whole = np.issubdtype(column.dtype, np.integer)
+    return is_whole and len(np.unique(column)) >= SMOOTH_FROM and bool(np.all(column[1:] >= column[:-1]))
+
+
 def _makes_groups(column: np.ndarray) -> bool:
     """Whether the values of a column (size,) may be names of groups, as numbers of receivers are among real ones too."""
     count = len(np.unique(column))
@@ -138,10 +144,11 @@ def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
         products = first[:, None] * second[None]
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
         yield _neighbourhoods((one, other), np.stack([found[one], found[other]], axis=1).astype(float))
-    crossed = [(one, other) for one, other in itertools.product(smooth, made) if one != other]
-    for one, other in crossed[:MOST_PAIRS]:
-        lines = grouped(made[other]).multiply(_line(found[one])).tocsr()
-        yield Curves(f"along {one} by {other}", lines, plain=True)
+    for along in (smooth, [n for n, c in found.items() if _is_rising(c)]):
+        crossed = [(one, other) for one, other in itertools.product(along, made) if one != other]
+        for one, other in crossed[:MOST_PAIRS]:
+            lines = grouped(made[other]).multiply(_line(found[one])).tocsr()
+            yield Curves(f"along {one} by {other}", lines, plain=True)
     yield from itertools.islice(_cells(made, size), MOST_PAIRS)
 
 

@@ -120,6 +120,20 @@ def test_a_line_along_one_column_may_differ_by_another():
         assert abs(np.corrcoef(line[band == b], distance[band == b])[0, 1]) == pytest.approx(1.0)
 
 
+def test_whole_numbers_that_only_rise_are_a_line_too():
+    """What some access points do since some day has too few readings in each cell of both."""
+    rng = np.random.default_rng(4)
+    day, point = np.sort(rng.integers(0, 20, 300)), rng.integers(0, 30, 300)
+    found = pairs(day=day, point=point)
+    assert "by point and day" not in found
+    lines = found["along day by point"].toarray()
+    assert lines.shape == (30, 300)
+    for p, line in enumerate(lines):
+        assert not line[point != p].any()
+        assert abs(np.corrcoef(line[point == p], day[point == p])[0, 1]) == pytest.approx(1.0)
+    assert "along day by point" not in pairs(day=rng.permutation(day), point=point)  # names, as far as is known
+
+
 def test_columns_on_different_axes_make_cells_too():
     rng = np.random.default_rng(6)
     given = {
