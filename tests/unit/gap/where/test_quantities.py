@@ -131,7 +131,8 @@ def test_whole_numbers_that_only_rise_are_a_line_too():
     for p, line in enumerate(lines):
         assert not line[point != p].any()
         assert abs(np.corrcoef(line[point == p], day[point == p])[0, 1]) == pytest.approx(1.0)
-    assert "along day by point" not in pairs(day=rng.permutation(day), point=point)  # names, as far as is known
+    mixed = pairs(day=rng.permutation(day), point=point)
+    assert "along day by point" not in mixed  # names, as far as is known
 
 
 def test_columns_on_different_axes_make_cells_too():
