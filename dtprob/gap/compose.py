@@ -135,11 +135,12 @@ def _undecided(sets: Sequence[Sequence[str]]) -> str:
 
 
 def _place(found: SiteFinding) -> str:
-    """A site, or a moment of an observation, as text."""
+    """A site, or a moment of an observation, as text; with the entry that stands out there."""
+    at = "" if found.place is None else f" (most of it at {found.place})"
     if found.moment is None:
-        return found.site
+        return found.site + at
     what, _, whither = found.moment.partition(" ")
-    return f"the {what} of {found.site} {whither}".rstrip()
+    return f"the {what} of {found.site} {whither}".rstrip() + at
 
 
 def _tried(evidence: Evidence) -> list[dict[str, Any]]:

@@ -99,4 +99,5 @@ def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, float, flo
 
 
 def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:
-    return {"site": found.site, "p_value": found.p_value, "share": share, "family": found.family}
+    there = {} if found.place is None else {"place": found.place}
+    return {"site": found.site, "p_value": found.p_value, "share": share, "family": found.family, **there}

@@ -89,12 +89,16 @@ class Tried(TypedDict):
 
 
 class Site(TypedDict):
-    """A site of the model, with its share of the gap; `family` says how it must change to close it."""
+    """A site of the model, with its share of the gap; `family` says how it must change to close it.
+
+    Where one group, position or reading brings most of what is wrong, `place` names it.
+    """
 
     site: str
     p_value: Probability | None
     share: Number
     family: NotRequired[str]
+    place: NotRequired[str]
 
 
 class Coordinates(TypedDict):

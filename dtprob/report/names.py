@@ -83,6 +83,11 @@ def located_words(site: Site) -> str:
     return " ".join([f"{what} of the {values}", *map(words, whither.split())]) if what else values
 
 
+def place_words(site: Site) -> str:
+    """` (most of it at access point 11)`, where one entry of a site stands out."""
+    return f" (most of it at {site['place'].replace('_', ' ')})" if "place" in site else ""
+
+
 def moment(site: Site) -> str | None:
     """What of an observation is wrong where its values are right, as its family tells it."""
     kind = site.get("family", "").partition(",")[0]

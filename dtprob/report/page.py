@@ -130,6 +130,7 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     names.words,
     names.site_words,
     names.located_words,
+    names.place_words,
     names.allowance,
     names.together,
     names.listing,

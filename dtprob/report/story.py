@@ -14,6 +14,7 @@ from dtprob.report.names import (
     listing,
     located_words,
     moment,
+    place_words,
     shares,
     significant,
     size_reading,
@@ -280,7 +281,7 @@ def advice(effect: str) -> str:
 def _seat(report: Report) -> str:
     """` and lies in the path delays`, where the remainder or the gap was located."""
     left = left_over(report) or significant(report["where"]["sites"])[:1]
-    return f" and lies in the {listing(located_words(site) for site in left[:2])}" if left else ""
+    return f" and lies in the {listing(located_words(s) + place_words(s) for s in left[:2])}" if left else ""
 
 
 _COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}

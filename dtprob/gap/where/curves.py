@@ -110,8 +110,9 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
         if _is_ordered(column):
             yield from over_column(name, column, _FINEST if len(found) <= _FEW else _COARSE)
         if _makes_groups(column):
-            groups = grouped(np.unique(column, return_inverse=True)[1])
-            yield Curves(f"by {name}", groups, column=name, plain=True)
+            index = np.unique(column, return_inverse=True)[1]
+            places = groups_in_words(index, {name: column})
+            yield Curves(f"by {name}", grouped(index), column=name, plain=True, places=places)
     yield from _pairs(found, size)
 
 
@@ -148,8 +149,9 @@ def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
         crossed = [(one, other) for one, other in itertools.product(along, made) if one != other]
         for one, other in crossed[:MOST_PAIRS]:
             lines = grouped(made[other]).multiply(_line(found[one])).tocsr()
-            yield Curves(f"along {one} by {other}", lines, plain=True)
-    yield from itertools.islice(_cells(made, size), MOST_PAIRS)
+            places = groups_in_words(made[other], {other: found[other]})
+            yield Curves(f"along {one} by {other}", lines, plain=True, places=places)
+    yield from itertools.islice(_cells(found, made), MOST_PAIRS)
 
 
 def _neighbourhoods(over: tuple[str, str], place: np.ndarray) -> Curves:
@@ -167,12 +169,13 @@ def _neighbourhoods(over: tuple[str, str], place: np.ndarray) -> Curves:
     return Curves(f"near a place of {over[0]} and {over[1]}", values, overlaps=True, places=places)
 
 
-def _cells(made: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
-    """By the groups of two columns, from their group of each position (size,)."""
+def _cells(found: Mapping[str, np.ndarray], made: Mapping[str, np.ndarray]) -> Iterator[Curves]:
+    """By the groups of two columns (size,), from the group of each position in each of them."""
     for one, other in itertools.combinations(made, 2):
         index = joined(made[one], made[other])
-        if index is not None and _CELL * (index.max() + 1) <= size:
-            yield Curves(f"by {one} and {other}", grouped(index), plain=True)
+        if index is not None and _CELL * (index.max() + 1) <= len(index):
+            places = groups_in_words(index, {one: found[one], other: found[other]})
+            yield Curves(f"by {one} and {other}", grouped(index), plain=True, places=places)
 
 
 def joined(one: np.ndarray, other: np.ndarray) -> np.ndarray | None:
@@ -184,6 +187,12 @@ def joined(one: np.ndarray, other: np.ndarray) -> np.ndarray | None:
 def grouped(index: np.ndarray) -> sparse.csr_matrix:
     """A weight for each group, from the groups of positions (size,)."""
     return sparse.csr_matrix((np.ones(len(index)), (index, np.arange(len(index)))))
+
+
+def groups_in_words(index: np.ndarray, columns: Mapping[str, np.ndarray]) -> tuple[str, ...]:
+    """Each group of positions (size,) by the values that columns (size,) have in it: `band 2 and day 11`."""
+    _, first = np.unique(index, return_index=True)
+    return tuple(" and ".join(f"{n} {float(column[i]):.6g}" for n, column in columns.items()) for i in first)
 
 
 def cycles(size: int, over: str) -> tuple[Curves, ...]:

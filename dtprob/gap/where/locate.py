@@ -29,6 +29,7 @@ from dtprob.gap.where.data_columns import all_columns, whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
+from dtprob.gap.where.foremost import foremost
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.moments import further_moments
 from dtprob.gap.where.quantities import Quantity, cells, groups, quantity
@@ -267,5 +268,6 @@ def _finding(
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
     score = max(map(_each, tests))
-    named = plainest(best, tests).label if p_value <= SURE else best.label
-    return SiteFinding(site.name, named, p_value, net, spreads=spreads, score=score)
+    named = plainest(best, tests) if p_value <= SURE else best
+    place = foremost(named, tests, site) if p_value <= SURE else None
+    return SiteFinding(site.name, named.label, p_value, net, spreads=spreads, score=score, place=place)

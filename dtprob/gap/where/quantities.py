@@ -16,6 +16,7 @@ from dtprob.gap.where.curves import (
     SMOOTH_FROM,
     Curves,
     grouped,
+    groups_in_words,
     joined,
     over_column,
 )
@@ -38,12 +39,14 @@ class Quantity:
         axes: along which it varies.
         values: at their positions.
         ordered: whether its values are more than names: near ones may act alike.
+        coded: whether its values stand for others, as numbers of groups do.
     """
 
     name: str
     axes: tuple[str, ...]
     values: np.ndarray
     ordered: bool = True
+    coded: bool = False
 
     def kept(self, axes: Sequence[str], shape: Sequence[int]) -> tuple[int, ...] | None:
         """Which of a site's axes are this one's; None where it lies on others."""
@@ -61,7 +64,8 @@ class Quantity:
             return
         distinct, index = np.unique(flat, return_inverse=True)
         if _OFTEN * len(distinct) <= flat.size:
-            yield Curves(f"by value of {self.name}", grouped(index), plain=True)
+            places = groups_in_words(index, {self.name: flat}) if not self.coded else ()
+            yield Curves(f"by value of {self.name}", grouped(index), plain=True, places=places)
         if self.ordered:
             yield from over_column(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
 
@@ -90,10 +94,11 @@ def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quant
         return
     yield Quantity(name, tuple(axes), values, ordered=_OFTEN * len(distinct) > values.size)
     each = last * index.reshape(values.shape) + np.arange(last)
-    yield Quantity(f"{name} of each {axes[-1]}", tuple(axes), each, ordered=False)
+    yield Quantity(f"{name} of each {axes[-1]}", tuple(axes), each, ordered=False, coded=True)
     if last > 1:
         _, rows = np.unique(values.reshape(-1, last), axis=0, return_inverse=True)
-        yield Quantity(f"{name} of all", tuple(axes[:-1]), rows.reshape(values.shape[:-1]), ordered=False)
+        whole = rows.reshape(values.shape[:-1])
+        yield Quantity(f"{name} of all", tuple(axes[:-1]), whole, ordered=False, coded=True)
 
 
 def cells(
@@ -113,7 +118,8 @@ def cells(
     for one, other in pairs[:MOST_PAIRS]:
         index = joined(*np.broadcast_arrays(few[one], few[other]))
         if index is not None:
-            yield Quantity(f"{one} and {other}", tuple(axes), np.broadcast_to(index, shape), ordered=False)
+            whole = np.broadcast_to(index, shape)
+            yield Quantity(f"{one} and {other}", tuple(axes), whole, ordered=False, coded=True)
 
 
 def _varies(values: np.ndarray) -> tuple[int, ...]:

@@ -31,6 +31,7 @@ class SiteFinding:
         last: whether it may be the shadow of another: a wrong mean spreads too, and far strays look like wrong means.
         spreads: whether moving the site moves nothing but spreads of observations.
         score: squared score of its values over the variance, on average over the entries of the family that has most.
+        place: in words, of the one entry that brings most of what is wrong; None where several do.
     """
 
     site: str
@@ -40,6 +41,7 @@ class SiteFinding:
     last: bool = False
     spreads: bool = False
     score: float = math.inf
+    place: str | None = None
 
     @property
     def moment(self) -> str | None:

@@ -1,0 +1,61 @@
+"""Which entry of a site family stands out: the group, the row or the output that brings most of what is wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Final
+
+import numpy as np
+from scipy import stats
+
+from dtprob.gap.where.families import Site
+from dtprob.gap.where.family_test import FamilyTest
+
+_MOST: Final = 0.6
+"""Share of what is more than chance that an entry has to bring; of two groups each brings a half."""
+_CHANCE: Final = 0.01
+"""Probability up to which the largest of so many entries may be that large by chance."""
+
+
+def foremost(named: FamilyTest, tests: Sequence[FamilyTest], site: Site) -> str | None:
+    """The place of the entry that brings most of what is wrong, in words; None where several do, or where it has none.
+
+    One far reading shows in every ripple, so that where the family that is named has no such entry, single ones are asked.
+
+    Args:
+        named: the test of the family that is named.
+        tests: of all families of the site.
+        site: that they perturb.
+    """
+    single = (t for t in tests if t.family.kind == named.family.kind and t.family.pattern.curves is None)
+    found = (_entry(test, site) for test in (named, *sorted(single, key=lambda t: -len(t.variance))))
+    return next((place for place in found if place is not None), None)
+
+
+def _entry(test: FamilyTest, site: Site) -> str | None:
+    """The entry of one family."""
+    curves = test.family.pattern.curves
+    if curves is not None and (curves.overlaps or not curves.places):
+        return None
+    parts = 2 if np.iscomplexobj(site.value) else 1
+    told = np.where(test.seen, test.first[0] ** 2 / np.where(test.seen, test.variance, 1.0), 0.0)
+    told, seen = told.reshape(-1, parts).sum(axis=1), test.seen.reshape(-1, parts).sum(axis=1)
+    top, excess = int(told.argmax()), told - seen
+    by_chance = len(told) * stats.chi2.sf(told[top], max(int(seen[top]), 1))
+    if len(told) < 2 or excess[top] < _MOST * excess.sum() or by_chance > _CHANCE:
+        return None
+    return _words(test, site, top, len(told))
+
+
+def _words(test: FamilyTest, site: Site, entry: int, count: int) -> str:
+    """An entry by its group and its positions along the axes that have weights of their own."""
+    pattern, words = test.family.pattern, []
+    axes = list(pattern.kept)
+    if pattern.curves is not None:
+        each = count // len(pattern.curves.places)
+        words, entry = [pattern.curves.places[entry // each]], entry % each
+        while axes and np.prod([site.value.shape[i] for i in axes]) > each:
+            axes.pop(0)  # the curves run along the first ones
+    place = np.unravel_index(entry, [site.value.shape[i] for i in axes]) if axes else ()
+    wide = [(i, n) for i, n in zip(axes, place, strict=True) if site.value.shape[i] > 1]
+    return ", ".join([*words, *(f"{site.axes[i]} {n}" for i, n in wide)])

@@ -1,0 +1,85 @@
+"""Which entry of a family of a wrong site is named: the one that brings most of what is wrong, if one does."""
+
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
+
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.settings import Settings
+from dtprob.gap.where.curves import Curves, grouped, groups_in_words
+from dtprob.gap.where.families import Family, Pattern
+from dtprob.gap.where.family_test import FamilyTest
+from dtprob.gap.where.foremost import foremost
+from dtprob.inference import Laplace
+
+READINGS = 120
+
+
+def told(scores, kept=(0,), found=None, shape=None, dtype=float):
+    """What is said of scores of unit variance."""
+    scores = np.asarray(scores, float)
+    site = SimpleNamespace(axes=("link", "antenna"), value=np.ones(shape or (len(scores), 1), dtype))
+    family = Family("additive", Pattern("so", kept, found), np.ones(()))
+    test = FamilyTest(family, 1e-9, np.ones(9), np.stack([scores] * 9), np.ones(len(scores)))
+    return foremost(test, [test], site)
+
+
+def test_the_entry_that_brings_most_is_named():
+    scores = np.random.default_rng(0).normal(size=60)
+    scores[17] = 9.0
+    assert told(scores) == "link 17"
+    assert told(scores, (0, 1), shape=(20, 3)) == "link 5, antenna 2"
+    assert told(scores, (0,), shape=(30, 1), dtype=complex) == "link 8"
+
+
+def test_none_is_named_where_several_are_wrong_or_all_may_be_chance():
+    scores = np.random.default_rng(0).normal(size=60)
+    assert told(scores) is None
+    scores[[3, 17]] = 9.0
+    assert told(scores) is None
+    assert told([6.0, -6.0]) is None  # of two groups one is as far off as the other
+    assert told([9.0]) is None
+
+
+def test_groups_are_named_by_their_values():
+    band, day = np.repeat([2, 5, 7], 40), np.tile([0.5, 1.5], 60)
+    index = np.unique(band, return_inverse=True)[1]
+    groups = Curves("by band", grouped(index), places=groups_in_words(index, {"band": band}))
+    assert told([1.0, 9.0, -1.0], found=groups, shape=(120, 1)) == "band 5"
+    each = [1.0, 0.5, -1.0, 9.0, 0.0, 1.0]
+    assert told(each, (0, 1), groups, (120, 2)) == "band 5, antenna 1"
+    both = np.unique(2 * index + (day > 1), return_inverse=True)[1]
+    assert groups_in_words(both, {"band": band, "day": day})[3] == "band 5 and day 1.5"
+    overlapping = Curves("beyond", np.eye(3), overlaps=True, places=("a", "b", "c"))
+    assert told([1.0, 9.0, -1.0], found=overlapping, shape=(3, 1)) is None  # its label says where
+
+
+def line(x, access_point, y=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 10.0))
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    mean = numpyro.deterministic("mean", level + slope * x)
+    noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
+    with numpyro.plate("reading", x.shape[0]):
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+
+@pytest.mark.parametrize(("which", "place"), [("group", "access_point 11"), ("reading", "reading 41")])
+def test_a_report_says_which_group_or_reading_it_is(which, place):
+    rng = np.random.default_rng(2)
+    x, access_point = (
+        rng.uniform(-1, 1, READINGS),
+        rng.permutation(np.repeat(np.arange(10, 18), READINGS // 8)),
+    )
+    wrong = 2.0 * (access_point == 11) if which == "group" else 12.0 * (np.arange(READINGS) == 41)
+    y = 1 + 2 * x + rng.normal(size=READINGS) + wrong
+    data = {"x": jnp.asarray(x), "access_point": jnp.asarray(access_point), "y": jnp.asarray(y)}
+    found = diagnose(
+        line, data, [], key=jax.random.key(0), engine=Laplace(), settings=Settings(site_replicates=99)
+    )
+    assert found.verdict == "UNLISTED"
+    assert {one.get("place") for one in found.to_report()["unlisted"]["located"]} == {place}
