@@ -25,6 +25,7 @@ class Settings:
         relevance: share of the gap that causes must close to count as its explanation where something is left.
         field_relevance: the same of random fields alone, which can imitate nearly anything.
         minor: a further effect must add this share of the evidence that the effects before it have brought.
+        remainder: whether what is left is modelled at its site, which takes long where sites have many entries.
         tolerance_db: residual error that the user does not care about, in dB below the signal; of powers, their root mean
             square error in dB, and of other readings, such as levels in dBm, that in their own unit. None for no tolerance.
     """
@@ -43,4 +44,5 @@ class Settings:
     relevance: float = 0.75
     field_relevance: float = 0.9
     minor: float = 0.03
+    remainder: bool = True
     tolerance_db: float | None = None

@@ -119,11 +119,13 @@ class Alone:
     """The fit with one family of a site and no effect, in the problem in which the family is live.
 
     Attributes:
+        name: of the family as an effect.
         problem: the model with the family as a field.
         fitted: the fit.
         weights: how many of the family's random weights the data determine.
     """
 
+    name: str
     problem: Problem
     fitted: fitting.Fit
     weights: float
@@ -151,7 +153,16 @@ def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) ->
     for name, suspect in named.items():
         one = _fitted_with(wider, fitted, name)
         if one.log_evidence - suspect.price > least:
-            yield Alone(wider, one, shared_weights(wider, one, name))
+            yield Alone(name, wider, one, shared_weights(wider, one, name))
+
+
+def beside(view: View, one: Alone) -> float:
+    """Log evidence of a fit's effects with one family of a site beside them, from the fits of either alone."""
+    family = [effect for effect in one.problem.effects if effect.name == one.name]
+    wider = view.problem.with_fields(family, one.problem.per_cluster & {one.name})
+    effects, spread = (*view.fitted.effects, one.name), view.fitted.spread | one.fitted.spread
+    starts = (wider.translate(at.fitted.x, at.problem) for at in (view, one))
+    return max(fitting.fit(wider, x, effects, spread=spread).log_evidence for x in starts)
 
 
 def _site_by_site(suspects: Sequence[Suspect]) -> list[Suspect]:

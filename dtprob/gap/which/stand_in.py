@@ -11,7 +11,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.determined import shared_weights
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.marginal import marginal
-from dtprob.gap.how_far.remainder import Alone, alone
+from dtprob.gap.how_far.remainder import Alone, alone, beside
 from dtprob.gap.view import View
 from dtprob.gap.which.trials import Say, credit
 
@@ -22,12 +22,15 @@ _FAR_SHARE: Final = 0.15
 """Nats, and share of what was gained, by which it has to be better than a single effect, real ones having other forms."""
 _ALIKE: Final = 0.5
 """Parameters by which it is simpler than they are."""
+_KEPT: Final = 0.5
+"""Share of its gain that what was found keeps beside it where both are wrong."""
 
 
 def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> bool:
     """Whether one family of a site is better than what was found, by how much depends on what that can imitate.
 
     One that is no simpler has to explain more: of two forms of the same the effects' own stands, whatever their priors.
+    What keeps its gain beside the best of them stands in for nothing: something else is wrong, too.
 
     Args:
         bare: the fit of the model alone.
@@ -47,10 +50,16 @@ def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> 
     effects = (effect for effect in end.problem.effects if effect.name in found.effects)
     fewest = sum(_freedom(end, effect) for effect in effects) - _ALIKE
     reached = cache(lambda: _likelihood(end))
-    return any(
-        one.weights < fewest or _likelihood(one) > reached() + _BETTER
+    better = [
+        one
         for one in alone(bare, least, lambda: say(doing))
-    )
+        if one.weights < fewest or _likelihood(one) > reached() + _BETTER
+    ]
+    if not better:
+        return False
+    best = max(better, key=lambda one: one.fitted.log_evidence)
+    kept = beside(end, best) - best.fitted.log_evidence
+    return kept < _KEPT * (found.log_evidence - base.log_evidence)
 
 
 def _freedom(end: View, effect: Effect) -> float:
