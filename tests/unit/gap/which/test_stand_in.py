@@ -1,0 +1,63 @@
+"""What was found beside something else that is wrong: kept if the best family of a site does not take its gain."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+
+from dtprob.effects import Effect, Parameter
+from dtprob.gap.diagnose import diagnose
+from dtprob.gap.settings import Settings
+from dtprob.inference import Laplace
+
+POINTS, EACH = 8, 30
+LEVELS = 1.5 * np.array([1.0, -1.0, 0.5, -0.5, 1.2, -1.2, 0.3, -0.3])
+
+
+def line(x, access_point, y=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 10.0))
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    mean = numpyro.deterministic("mean", level + slope * x)
+    noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
+    with numpyro.plate("reading", x.shape[0]):
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+
+def effect(name, shape):
+    return Effect(
+        name,
+        {"mean": lambda value, p, data: value + p["size"] * shape(data)},
+        (Parameter("size", dist.Normal(0.0, 2.0)),),
+    )
+
+
+BEND = effect("bend", lambda data: data["x"] ** 2)
+FIRST = effect("first_points", lambda data: data["access_point"] < 2)
+
+
+def found(candidate, curvature, levels):
+    rng = np.random.default_rng(3)
+    x, point = rng.uniform(-1, 1, POINTS * EACH), rng.permutation(np.repeat(np.arange(POINTS), EACH))
+    y = 1 + 2 * x + rng.normal(size=x.size) + levels[point] + curvature * x**2
+    data = {"x": jnp.asarray(x), "access_point": jnp.asarray(point), "y": jnp.asarray(y)}
+    settings = Settings(site_replicates=50, remainder=False)
+    return diagnose(line, data, [candidate], key=jax.random.key(0), engine=Laplace(), settings=settings)
+
+
+def test_an_effect_beside_unknown_levels_is_kept():
+    """Levels of access points, which no effect knows, bring four times its gain."""
+    said = found(BEND, 1.6, LEVELS)
+    assert said.verdict == "UNLISTED"
+    (cause,) = said.causes
+    assert cause.effects == ("bend",)
+    assert cause.size[0].low > 0.0
+    assert said.to_report()["remainder"] is None
+
+
+def test_an_effect_that_takes_up_a_part_of_unknown_levels_is_not():
+    """Two access points of eight are as far off as the effect says, others are, too."""
+    levels = 2.0 * np.array([1.0, 1.0, -1.0, -1.0, 1.5, -1.5, 0.8, -0.8])
+    said = found(FIRST, 0.0, levels)
+    assert said.verdict == "UNLISTED"
+    assert not said.causes
