@@ -52,9 +52,10 @@ SETTINGS: Final = Settings(
     folds=3,
     grid=24,
     starts=3,
-    relevance=0.5,
+    relevance=0.2,
+    remainder=False,
 )
-"""Of every diagnosis: one effect, the best refit freed from local optima, named where it closes half: more is lacking."""
+"""Of every diagnosis: one effect, one refit freed from local optima, named where it closes a fifth: more is lacking."""
 _SAME_PLACE: Final = 1e-3
 _PLACE: Final = re.compile(r"(\w+)\[(transmitter|receiver)_(\d+)\]")
 """An effect of one end's place."""

@@ -136,11 +136,11 @@ EFFECTS: Final = (
 through walls."""
 
 LACKING: Final = (
-    *("transmitter_displacement", "receiver_displacement", "scene_scale", "polarization_mismatch"),
-    *("missing_path[line_of_sight]", "missing_path[reflection]", "wall_law", "depth_cut_off"),
+    *("polarization_mismatch", "missing_path[line_of_sight]", "missing_path[reflection]", "wall_law"),
+    "depth_cut_off",
 )
 """What the honest twin may be found to lack: things that have the same name in every twin. The campaign's own notes, of
-whose place is whose, the carrier and the bandwidth, are believed there."""
+places to a centimetre and whose they are, the carrier and the bandwidth, are believed there."""
 
 LEFT_OUT: Final = ("receiver_displacement[each_link]", "transmitter_displacement[each_link]")
 """Random fields that imitate any error of the geometry: the honest twin calls for the first."""

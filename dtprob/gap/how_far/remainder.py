@@ -36,6 +36,8 @@ _SAME: Final = 0.99
 """Families of one pattern and nearly the same evidence are one thing under two names."""
 _PROMISING: Final = 0.5
 """Share of a gain that a family's evidence to first order shows at least."""
+_FINE, _COARSE = 1e-3, 0.03
+"""Nats that a step of a fit has to gain, and where it is compared by whole nats with what effects gain."""
 _NAME: Final = "remainder"
 
 
@@ -151,7 +153,7 @@ def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) ->
     begun()
     wider, fitted = _wider(view, named)
     for name, suspect in named.items():
-        one = _fitted_with(wider, fitted, name)
+        one = _fitted_with(wider, fitted, name, tolerance=_COARSE)
         if one.log_evidence - suspect.price > least:
             yield Alone(name, wider, one, shared_weights(wider, one, name))
 
@@ -162,7 +164,8 @@ def beside(view: View, one: Alone) -> float:
     wider = view.problem.with_fields(family, one.problem.per_cluster & {one.name})
     effects, spread = (*view.fitted.effects, one.name), view.fitted.spread | one.fitted.spread
     starts = (wider.translate(at.fitted.x, at.problem) for at in (view, one))
-    return max(fitting.fit(wider, x, effects, spread=spread).log_evidence for x in starts)
+    fits = (fitting.fit(wider, x, effects, spread=spread, tolerance=_COARSE) for x in starts)
+    return max(fit.log_evidence for fit in fits)
 
 
 def _site_by_site(suspects: Sequence[Suspect]) -> list[Suspect]:
@@ -217,10 +220,12 @@ def _forward(problem: Problem, fitted: fitting.Fit, names: Sequence[str]) -> fit
     return fitted
 
 
-def _fitted_with(problem: Problem, fitted: fitting.Fit, name: str) -> fitting.Fit:
+def _fitted_with(
+    problem: Problem, fitted: fitting.Fit, name: str, *, tolerance: float = _FINE
+) -> fitting.Fit:
     """The fit with one more field."""
     spread = {**fitted.spread, name: 1.0}
-    return fitting.fit(problem, fitted.x, (*fitted.effects, name), spread=spread)
+    return fitting.fit(problem, fitted.x, (*fitted.effects, name), spread=spread, tolerance=tolerance)
 
 
 def _term(problem: Problem, suspect: Suspect) -> Term:

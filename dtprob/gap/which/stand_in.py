@@ -30,7 +30,8 @@ def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> 
     """Whether one family of a site is better than what was found, by how much depends on what that can imitate.
 
     One that is no simpler has to explain more: of two forms of the same the effects' own stands, whatever their priors.
-    What keeps its gain beside the best of them stands in for nothing: something else is wrong, too.
+    What keeps its gain beside the best of them stands in for nothing: something else is wrong, too. The most promising
+    families come first, and the first that leaves too little of the gain decides.
 
     Args:
         bare: the fit of the model alone.
@@ -50,16 +51,15 @@ def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> 
     effects = (effect for effect in end.problem.effects if effect.name in found.effects)
     fewest = sum(_freedom(end, effect) for effect in effects) - _ALIKE
     reached = cache(lambda: _likelihood(end))
-    better = [
-        one
-        for one in alone(bare, least, lambda: say(doing))
-        if one.weights < fewest or _likelihood(one) > reached() + _BETTER
-    ]
-    if not better:
-        return False
-    best = max(better, key=lambda one: one.fitted.log_evidence)
-    kept = beside(end, best) - best.fitted.log_evidence
-    return kept < _KEPT * (found.log_evidence - base.log_evidence)
+    enough, most = _KEPT * (found.log_evidence - base.log_evidence), -np.inf
+    for one in alone(bare, least, lambda: say(doing)):
+        alone_there = one.fitted.log_evidence
+        explains_more = one.weights < fewest or _likelihood(one) > reached() + _BETTER
+        if explains_more and alone_there > most:
+            most = alone_there
+            if beside(end, one) - alone_there < enough:
+                return True
+    return False
 
 
 def _freedom(end: View, effect: Effect) -> float:
