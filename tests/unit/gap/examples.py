@@ -231,3 +231,13 @@ def use(problem, data):
     problem.compiled.arrays = problem.compiled.arrays._replace(data=problem.arrays)
     problem.observed = Observed(problem._declared, problem.arrays)
     return problem
+
+
+def of_access_points(x, access_point, y=None):
+    """A line with noise; what `access_point` says has no part in it."""
+    slope = numpyro.sample("slope", dist.Normal(0.0, 10.0))
+    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+    mean = numpyro.deterministic("mean", level + slope * x)
+    noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
+    with numpyro.plate("reading", x.shape[0]):
+        numpyro.sample("y", dist.Normal(mean, noise), obs=y)

@@ -5,8 +5,6 @@ from types import SimpleNamespace
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
-import numpyro.distributions as dist
 import pytest
 
 from dtprob.gap.diagnose import diagnose
@@ -16,6 +14,7 @@ from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import FamilyTest
 from dtprob.gap.where.foremost import foremost
 from dtprob.inference import Laplace
+from tests.unit.gap.examples import of_access_points
 
 READINGS = 120
 
@@ -59,15 +58,6 @@ def test_groups_are_named_by_their_values():
     assert told([1.0, 9.0, -1.0], found=overlapping, shape=(3, 1)) is None  # its label says where
 
 
-def line(x, access_point, y=None):
-    slope = numpyro.sample("slope", dist.Normal(0.0, 10.0))
-    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
-    mean = numpyro.deterministic("mean", level + slope * x)
-    noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
-    with numpyro.plate("reading", x.shape[0]):
-        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
-
-
 @pytest.mark.parametrize(("which", "place"), [("group", "access_point 11"), ("reading", "reading 41")])
 def test_a_report_says_which_group_or_reading_it_is(which, place):
     rng = np.random.default_rng(2)
@@ -79,7 +69,12 @@ def test_a_report_says_which_group_or_reading_it_is(which, place):
     y = 1 + 2 * x + rng.normal(size=READINGS) + wrong
     data = {"x": jnp.asarray(x), "access_point": jnp.asarray(access_point), "y": jnp.asarray(y)}
     found = diagnose(
-        line, data, [], key=jax.random.key(0), engine=Laplace(), settings=Settings(site_replicates=99)
+        of_access_points,
+        data,
+        [],
+        key=jax.random.key(0),
+        engine=Laplace(),
+        settings=Settings(site_replicates=99),
     )
     assert found.verdict == "UNLISTED"
     assert {one.get("place") for one in found.to_report()["unlisted"]["located"]} == {place}

@@ -3,25 +3,16 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import numpyro
 import numpyro.distributions as dist
 
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
+from tests.unit.gap.examples import of_access_points
 
 POINTS, EACH = 8, 30
 LEVELS = 1.5 * np.array([1.0, -1.0, 0.5, -0.5, 1.2, -1.2, 0.3, -0.3])
-
-
-def line(x, access_point, y=None):
-    slope = numpyro.sample("slope", dist.Normal(0.0, 10.0))
-    level = numpyro.sample("level", dist.Normal(0.0, 10.0))
-    mean = numpyro.deterministic("mean", level + slope * x)
-    noise = numpyro.sample("noise", dist.LogNormal(0.0, 1.0))
-    with numpyro.plate("reading", x.shape[0]):
-        numpyro.sample("y", dist.Normal(mean, noise), obs=y)
 
 
 def effect(name, shape):
@@ -42,7 +33,9 @@ def found(candidate, curvature, levels):
     y = 1 + 2 * x + rng.normal(size=x.size) + levels[point] + curvature * x**2
     data = {"x": jnp.asarray(x), "access_point": jnp.asarray(point), "y": jnp.asarray(y)}
     settings = Settings(site_replicates=50, remainder=False)
-    return diagnose(line, data, [candidate], key=jax.random.key(0), engine=Laplace(), settings=settings)
+    return diagnose(
+        of_access_points, data, [candidate], key=jax.random.key(0), engine=Laplace(), settings=settings
+    )
 
 
 def test_an_effect_beside_unknown_levels_is_kept():
