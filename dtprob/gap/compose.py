@@ -95,8 +95,9 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence, *, tole
             much = "Part" if best and best.closed_fraction and best.closed_fraction.mean < _MOST else "Most"
             return f"{much} of the gap comes from {name}{closed_part}; {_rest(evidence)} left."
         case "UNLISTED":
-            sites = ", ".join(_place(s) for s in evidence.after.sites[:2] if s.p_value <= 0.01)
-            tail = f" It shows at {sites}." if sites else ""
+            sites = [s for s in evidence.after.sites[:2] if s.p_value <= 0.01]
+            at = f"; most of it at {sites[0].place}" if sites and sites[0].place is not None else ""
+            tail = f" It shows at {', '.join(map(_place, sites))}{at}." if sites else ""
             verb = "imitate" if best is not None and len(best.effects) > 1 else "imitates"
             part = f" {name} {verb} part of it." if name else ""
             why = (
@@ -135,12 +136,11 @@ def _undecided(sets: Sequence[Sequence[str]]) -> str:
 
 
 def _place(found: SiteFinding) -> str:
-    """A site, or a moment of an observation, as text; with the entry that stands out there."""
-    at = "" if found.place is None else f" (most of it at {found.place})"
+    """A site, or a moment of an observation, as text."""
     if found.moment is None:
-        return found.site + at
+        return found.site
     what, _, whither = found.moment.partition(" ")
-    return f"the {what} of {found.site} {whither}".rstrip() + at
+    return f"the {what} of {found.site} {whither}".rstrip()
 
 
 def _tried(evidence: Evidence) -> list[dict[str, Any]]:

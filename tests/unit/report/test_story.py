@@ -200,6 +200,12 @@ def test_a_site_that_is_wrong_in_two_ways_is_told_as_it_is_most_surely() -> None
     assert [names.located_words(site) for site in left_over(bare)] == ["readings"]
 
 
+def test_the_place_that_stands_out_is_told_in_words() -> None:
+    site = {"site": "mean", "p_value": 1e-9, "share": 0.9, "family": "additive, by access_point"}
+    assert not names.place_words(site)
+    assert names.place_words({**site, "place": "access_point 11"}) == " (most of it at access point 11)"
+
+
 def _report(**terms: list[float]) -> names.Any:
     row = {"sites": ["y"], "z": 1.0, "p_value": 0.5, "adjusted_p_value": 1.0}
     absorbed = {"effect": "c", "absorbed_by": "gain", **row}

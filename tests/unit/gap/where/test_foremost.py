@@ -78,3 +78,4 @@ def test_a_report_says_which_group_or_reading_it_is(which, place):
     )
     assert found.verdict == "UNLISTED"
     assert {one.get("place") for one in found.to_report()["unlisted"]["located"]} == {place}
+    assert found.summary.endswith(f"; most of it at {place}.")
