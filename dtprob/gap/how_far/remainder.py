@@ -161,7 +161,7 @@ def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) ->
 def beside(view: View, one: Alone) -> float:
     """Log evidence of a fit's effects with one family of a site beside them, from the fits of either alone."""
     family = [effect for effect in one.problem.effects if effect.name == one.name]
-    wider = view.problem.with_fields(family, one.problem.per_cluster & {one.name})
+    wider = view.problem.with_fields(family, [*one.problem.per_cluster & {one.name}])
     effects, spread = (*view.fitted.effects, one.name), view.fitted.spread | one.fitted.spread
     starts = (wider.translate(at.fitted.x, at.problem) for at in (view, one))
     fits = (fitting.fit(wider, x, effects, spread=spread, tolerance=_COARSE) for x in starts)
