@@ -36,8 +36,8 @@ _SAME: Final = 0.99
 """Families of one pattern and nearly the same evidence are one thing under two names."""
 _PROMISING: Final = 0.5
 """Share of a gain that a family's evidence to first order shows at least."""
-_FINE, _COARSE = 1e-3, 0.03
-"""Nats that a step of a fit has to gain, and where it is compared by whole nats with what effects gain."""
+_COARSE: Final = 0.03
+"""Nats that a step of a fit has to gain where it is compared by whole nats with what effects gain."""
 _NAME: Final = "remainder"
 
 
@@ -153,7 +153,7 @@ def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) ->
     begun()
     wider, fitted = _wider(view, named)
     for name, suspect in named.items():
-        one = _fitted_with(wider, fitted, name, tolerance=_COARSE)
+        one = fitting.fit(wider, fitted.x, (name,), spread={name: 1.0}, tolerance=_COARSE)
         if one.log_evidence - suspect.price > least:
             yield Alone(name, wider, one, shared_weights(wider, one, name))
 
@@ -220,12 +220,10 @@ def _forward(problem: Problem, fitted: fitting.Fit, names: Sequence[str]) -> fit
     return fitted
 
 
-def _fitted_with(
-    problem: Problem, fitted: fitting.Fit, name: str, *, tolerance: float = _FINE
-) -> fitting.Fit:
+def _fitted_with(problem: Problem, fitted: fitting.Fit, name: str) -> fitting.Fit:
     """The fit with one more field."""
     spread = {**fitted.spread, name: 1.0}
-    return fitting.fit(problem, fitted.x, (*fitted.effects, name), spread=spread, tolerance=tolerance)
+    return fitting.fit(problem, fitted.x, (*fitted.effects, name), spread=spread)
 
 
 def _term(problem: Problem, suspect: Suspect) -> Term:

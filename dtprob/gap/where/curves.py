@@ -106,14 +106,14 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     yield Curves(f"smooth in {axis}", _waves(place, 1, ORDER))
     yield from _ripples(axis, place, _FINEST)
     found = columns(problem, axis, size)
+    made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}
+    places = {n: groups_in_words(index, {n: found[n]}) for n, index in made.items()}
     for name, column in found.items():
         if _is_ordered(column):
             yield from over_column(name, column, _FINEST if len(found) <= _FEW else _COARSE)
-        if _makes_groups(column):
-            index = np.unique(column, return_inverse=True)[1]
-            places = groups_in_words(index, {name: column})
-            yield Curves(f"by {name}", grouped(index), column=name, plain=True, places=places)
-    yield from _pairs(found, size)
+        if name in made:
+            yield Curves(f"by {name}", grouped(made[name]), column=name, plain=True, places=places[name])
+    yield from _pairs(found, made, places, size)
 
 
 def _is_ordered(column: np.ndarray) -> bool:
@@ -136,9 +136,20 @@ def _makes_groups(column: np.ndarray) -> bool:
     return not _is_ordered(column) or (count <= GROUPS and _SHARED * count <= len(column))
 
 
-def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
-    """What varies with two columns (size,) together: smooth over both, along one in each group, by groups of both."""
-    made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}
+def _pairs(
+    found: Mapping[str, np.ndarray],
+    made: Mapping[str, np.ndarray],
+    places: Mapping[str, tuple[str, ...]],
+    size: int,
+) -> Iterator[Curves]:
+    """What varies with two columns (size,) together: smooth over both, along one in each group, by groups of both.
+
+    Args:
+        found: the columns.
+        made: of those that make groups, the group of each position.
+        places: the groups of each of these, in words.
+        size: positions.
+    """
     smooth = [n for n, c in found.items() if _is_ordered(c) and np.issubdtype(c.dtype, np.floating)]
     for one, other in list(itertools.combinations(smooth, 2))[:MOST_PAIRS]:
         first, second = (_waves(_rank(found[name]), 1, _CROSSED) for name in (one, other))
@@ -149,8 +160,7 @@ def _pairs(found: Mapping[str, np.ndarray], size: int) -> Iterator[Curves]:
         crossed = [(one, other) for one, other in itertools.product(along, made) if one != other]
         for one, other in crossed[:MOST_PAIRS]:
             lines = grouped(made[other]).multiply(_line(found[one])).tocsr()
-            places = groups_in_words(made[other], {other: found[other]})
-            yield Curves(f"along {one} by {other}", lines, plain=True, places=places)
+            yield Curves(f"along {one} by {other}", lines, plain=True, places=places[other])
     yield from itertools.islice(_cells(found, made), MOST_PAIRS)
 
 

@@ -57,12 +57,18 @@ class FamilyTest(NamedTuple):
         return self.variance > 1e-12 * max(float(self.variance.max(initial=0.0)), 1e-300)
 
     @property
+    def told(self) -> np.ndarray:
+        """The data's squared scores over their variance, (entry,); 0 where the data do not depend on an entry."""
+        seen = self.seen
+        return np.where(seen, self.first[0] ** 2 / np.where(seen, self.variance, 1.0), 0.0)
+
+    @property
     def label(self) -> str:
         """The family in words; of curves that overlap, the place that tells most."""
         curves = self.family.pattern.curves
         if curves is None or not curves.overlaps or not self.seen.any():
             return self.family.label
-        told = np.where(self.seen, self.first[0] ** 2 / np.where(self.seen, self.variance, 1.0), 0.0)
+        told = self.told
         return f"{self.family.kind}, {curves.places[int(told.argmax()) // (len(told) // len(curves.places))]}"
 
 

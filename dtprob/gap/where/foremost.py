@@ -38,8 +38,7 @@ def _entry(test: FamilyTest, site: Site) -> str | None:
     if curves is not None and (curves.overlaps or not curves.places):
         return None
     parts = 2 if np.iscomplexobj(site.value) else 1
-    told = np.where(test.seen, test.first[0] ** 2 / np.where(test.seen, test.variance, 1.0), 0.0)
-    told, seen = told.reshape(-1, parts).sum(axis=1), test.seen.reshape(-1, parts).sum(axis=1)
+    told, seen = (entries.reshape(-1, parts).sum(axis=1) for entries in (test.told, test.seen))
     top, excess = int(told.argmax()), told - seen
     by_chance = len(told) * stats.chi2.sf(told[top], max(int(seen[top]), 1))
     if len(told) < 2 or excess[top] < _MOST * excess.sum() or by_chance > _CHANCE:

@@ -223,9 +223,7 @@ def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
             and test.family.pattern.kept == wide
             and test.family.pattern.curves is None
         ):
-            gain = np.where(
-                test.seen, 0.5 * (test.first[0] ** 2 / np.where(test.seen, test.variance, 1.0) - 1), 0.0
-            )
+            gain = np.where(test.seen, 0.5 * (test.told - 1), 0.0)
             yield gain.reshape(*site.value.shape, -1).sum(-1)
 
 
@@ -245,7 +243,7 @@ def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> Sit
 def _each(test: FamilyTest) -> float:
     """The data's squared score over its variance, on average over the entries; tells families apart where p-values end."""
     seen = test.seen
-    return float((test.first[0, seen] ** 2 / test.variance[seen]).mean()) if seen.any() else 0.0
+    return float(test.told[seen].mean()) if seen.any() else 0.0
 
 
 def _finding(
@@ -268,6 +266,8 @@ def _finding(
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
     score = max(map(_each, tests))
-    named = plainest(best, tests) if p_value <= SURE else best
-    place = foremost(named, tests, site) if p_value <= SURE else None
+    named, place = best, None
+    if p_value <= SURE:
+        named = plainest(best, tests)
+        place = foremost(named, tests, site)
     return SiteFinding(site.name, named.label, p_value, net, spreads=spreads, score=score, place=place)

@@ -53,11 +53,11 @@ def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> 
     reached = cache(lambda: _likelihood(end))
     enough, most = _KEPT * (found.log_evidence - base.log_evidence), -np.inf
     for one in alone(bare, least, lambda: say(doing)):
-        alone_there = one.fitted.log_evidence
-        explains_more = one.weights < fewest or _likelihood(one) > reached() + _BETTER
-        if explains_more and alone_there > most:
-            most = alone_there
-            if beside(end, one) - alone_there < enough:
+        if one.fitted.log_evidence > most and (
+            one.weights < fewest or _likelihood(one) > reached() + _BETTER
+        ):
+            most = one.fitted.log_evidence
+            if beside(end, one) - most < enough:
                 return True
     return False
 
