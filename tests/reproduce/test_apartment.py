@@ -190,13 +190,14 @@ def test_every_twin_can_be_traced(measured, tmp_path, twin: Twin):
     assert wrong == named
 
 
+@pytest.mark.study
 @pytest.mark.measured
 @pytest.mark.usefixtures("measured")
 @pytest.mark.parametrize(
     ("name", "scene", "alone", "reached"),
     [
         ("depth", {"max_depth": 1, "check_depth": 2}, True, 17),
-        pytest.param("honest", {}, False, len(LINKS), marks=pytest.mark.study),
+        ("honest", {}, False, len(LINKS)),
     ],
 )
 def test_losses_are_counted_in_nats_of_a_link(name, scene, alone, reached, monkeypatch):

@@ -29,6 +29,7 @@ def test_the_toys_truth_is_the_twins_channel_where_no_wall_is_misplaced(monkeypa
     assert power == pytest.approx(float(jnp.sum(jnp.abs(gain) ** 2)), rel=1e-9)
 
 
+@pytest.mark.study
 def test_the_toy_in_small(monkeypatch):
     monkeypatch.setattr(fig5, "BANDWIDTHS", (500e6,))
     monkeypatch.setattr(fig5, "SNAPSHOTS", 4)

@@ -149,6 +149,7 @@ def _masked(paths, only):
     return eqx.tree_at(lambda p: p.mask, paths, paths.mask & only)
 
 
+@pytest.mark.study
 def test_knowing_of_phase_errors_pays():
     found = fig8.band(jax.random.key(0), 2, read_simulated(), 200e6, Progress())
     error = {scheme: np.median(one.error) for scheme, one in found.outcomes.items()}

@@ -32,6 +32,7 @@ def test_intervals_cover(quality):
     assert covers(found.coverage[2], 0.88, 0.92)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("quality", ["good", "useless"])
 def test_the_tuned_scheme_does_not_lose(quality):
     found = study(jax.random.key(3), RUNS, Setting(quality, 100, 2000, 5))

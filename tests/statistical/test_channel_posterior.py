@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro
+import pytest
 from arviz_stats.base import array_stats
 from scipy import stats
 
@@ -47,6 +48,7 @@ def estimates(draws):
     return list(zip((draws.mean(), draws.std()), map(float, errors), strict=True))
 
 
+@pytest.mark.study
 def test_two_samplers_agree_on_materials_and_noise():
     """z-scores of means and standard deviations; two-sided, all together at the declared failure rate.
 

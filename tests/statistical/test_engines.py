@@ -59,6 +59,7 @@ LONG = {
     "exact, multi_access",
     "blackjax_nuts, phase_error_channel",
     "nuts, circular",
+    "nuts, custom",
     "smc, circular",
     "svi, normal",
     "ensemble, normal",

@@ -162,6 +162,7 @@ def test_two_names_of_one_rewrite_are_one_class():
     assert float(screening.correlation.sel(effect="ripple", other_effect="twin")) > 0.999
 
 
+@pytest.mark.study
 def test_random_levels_are_a_variance_effect():
     shift = 0.8 * np.random.default_rng(3).normal(size=(12, 1))
     found = run(line, draw("line", seed=8, shift=shift))
@@ -229,6 +230,7 @@ def test_sizes_too_are_relative_to_earlier_data():
     assert sizes[0].high - sizes[0].low < 0.4  # twice 1.64 standard deviations of 0.07, and room
 
 
+@pytest.mark.study
 def test_another_engine_too_knows_the_earlier_data():
     plain = Problem(line, draw("line", seed=41, shift=0.6), (raised(),), None, Earlier())
     problem = plain.with_live(["raised"])
@@ -283,6 +285,7 @@ def wave(x, y=None):
         numpyro.sample("y", dist.Normal(mean, SIGMA), obs=y)
 
 
+@pytest.mark.study
 def test_a_base_fit_in_a_wrong_basin_is_taken_back(monkeypatch):
     rng = np.random.default_rng(0)
     x = rng.uniform(0.0, 2.0, (12, 20))
@@ -296,6 +299,7 @@ def test_a_base_fit_in_a_wrong_basin_is_taken_back(monkeypatch):
     assert found.to_report()["fit"]["nuisances"][0]["mean"] == pytest.approx(2.0, abs=0.02)
 
 
+@pytest.mark.study
 def test_a_column_may_name_the_clusters():
     rng = np.random.default_rng(0)
     x, device = rng.normal(size=90), rng.integers(0, 9, 90)
@@ -362,6 +366,7 @@ def test_an_unknown_distribution_is_refused():
         run(waiting, {"x": jnp.zeros(6), "y": jnp.ones(6)}, (bend(),))
 
 
+@pytest.mark.study
 def test_a_pair_of_parameters_is_one_effect():
     x = inputs()
     found = run(line, draw("line", seed=11, shift=0.5 * np.cos(2 * x) + 0.1 * x**3), (pair(), saturation()))
@@ -385,7 +390,11 @@ def town(east, north, power=None):
     ("wrong", "labels"),
     [
         (lambda distance, _power: 2.0 * np.sin(2 * np.pi * distance / 40), ("ripple in distance, 17 to 32",)),
-        (lambda _distance, power: np.minimum(-95.0 - power, 0.0), ("along ", "beyond ")),
+        pytest.param(
+            lambda _distance, power: np.minimum(-95.0 - power, 0.0),
+            ("along ", "beyond "),
+            marks=pytest.mark.study,
+        ),
     ],
     ids=["a wave from the ground", "a receiver that saturates"],
 )

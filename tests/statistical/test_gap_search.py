@@ -109,6 +109,7 @@ def test_a_family_that_says_the_same_in_another_form_takes_nothing_back(seed):
     assert set(end.view.fitted.effects) == {"louder", "apart"}
 
 
+@pytest.mark.study
 def test_nothing_is_found_where_there_is_nothing():
     """Four diagnoses at a level of 1%: one alarm has probability .04, two .0006."""
     assert sum(look(rows(10 + s), s)[0].view.alarmed(SETTINGS) for s in range(4)) <= 1

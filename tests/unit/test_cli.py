@@ -295,6 +295,7 @@ def test_a_finished_fit_is_kept_by_resume_only_while_nothing_changed(case, capsy
     assert (out / "summary.json").read_bytes() != first
 
 
+@pytest.mark.study
 def test_resume_keeps_no_posterior_of_another_model(case, capsys, tmp_path):
     out = tmp_path / "out"
     words = ["fit", str(case), "--out", str(out), "--resume"]
@@ -316,6 +317,7 @@ def test_a_checkpoint_of_another_run_is_not_gone_on_with(case, capsys, tmp_path)
     assert {entry.name for entry in out.iterdir()} == {"posterior.nc", "posterior.identity", "summary.json"}
 
 
+@pytest.mark.study
 def test_a_run_that_ends_before_its_first_checkpoint_leaves_no_other_ones(case, monkeypatch, tmp_path):
     out = tmp_path / "out"
     out.mkdir()

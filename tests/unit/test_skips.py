@@ -20,7 +20,9 @@ def test_other():
 """
 
 
-@pytest.mark.parametrize(("ci", "failed", "skipped"), [("true", 1, 1), ("", 0, 2)])
+@pytest.mark.parametrize(
+    ("ci", "failed", "skipped"), [("true", 1, 1), pytest.param("", 0, 2, marks=pytest.mark.study)]
+)
 def test_missing_means_failure_on_ci(tmp_path, ci, failed, skipped):
     root = Path(__file__).parents[2]
     shutil.copy(root / "tests" / "conftest.py", tmp_path / "conftest.py")

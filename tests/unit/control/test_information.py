@@ -74,6 +74,7 @@ def test_an_episodes_outcomes_are_remembered():
     np.testing.assert_allclose(memory.reception, reception, rtol=1e-6)
 
 
+@pytest.mark.study
 def test_draws_reweighted_by_an_episode_agree_with_its_counts():
     draws = 20_000
     tables = DirichletTables({"log_arrival": ARRIVAL, "log_reception": RECEPTION})

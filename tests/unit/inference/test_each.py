@@ -29,7 +29,7 @@ SHORT = {
 
 @pytest.mark.parametrize(
     "engine",
-    ["nuts", "laplace", *(pytest.param(name, marks=pytest.mark.study) for name in ("blackjax_nuts", "hmc"))],
+    ["nuts", *(pytest.param(name, marks=pytest.mark.study) for name in ("laplace", "blackjax_nuts", "hmc"))],
 )
 def test_the_same_draws_as_alone_but_for_rounding(engine):
     """Before rounding has been amplified: chains without adaptation, a few draws."""

@@ -72,6 +72,7 @@ def test_agrees_with_nuts():
     np.testing.assert_array_less(np.abs(exact.mean(axis=0) - nuts.mean(axis=0)), 5 * error)
 
 
+@pytest.mark.study
 def test_mode_is_the_textbooks(arguments):
     data = {**arguments, "concentration": 1.01}
     point = Point()(KEY, multi_access, data).flat("log_arrival")[0]

@@ -38,11 +38,11 @@ RUNS = {
     "blackjax_nuts": BlackJAXNUTS(**SHORT),
     "hmc": HMC(**SHORT),
     "smc": SMC(draws=60, chains=2, moves=1, leapfrog=2),
-    "svi": SVI(steps=400, draws=20, starts=1, particles=2),
+    "svi": SVI(steps=240, draws=20, starts=1, particles=2),
     "von_mises_em": VonMisesEM(draws=20),
     "ensemble": Ensemble(members=4, base="laplace", settings={"draws": 5, "starts": 1}),
 }
-ALIKE = {"blackjax_nuts", "hmc", "von_mises_em"}  # run by the same loops as nuts and svi
+ALIKE = {"blackjax_nuts", "hmc", "smc", "ensemble", "von_mises_em"}  # run by the same loops as nuts and svi
 
 
 def run(name, **options):

@@ -58,6 +58,7 @@ def test_evidence_and_mode_of_a_positive_site():
     assert float(posterior.extra["log_evidence"]) == pytest.approx(exact, abs=0.002)
 
 
+@pytest.mark.study
 def test_the_mode_agrees_with_another_optimiser():
     data = logistic_data()
     posterior = Laplace(draws=10)(KEY, logistic, data)

@@ -23,7 +23,7 @@ def counts_data(concentration):
     return {"concentration": np.float64(concentration), "total": np.int64(20), "y": COUNTS}
 
 
-@pytest.mark.parametrize("concentration", [1.01, 3.0])
+@pytest.mark.parametrize("concentration", [pytest.param(1.01, marks=pytest.mark.study), 3.0])
 def test_mode_of_a_dirichlet(concentration):
     posterior = Point()(KEY, counts, counts_data(concentration))
     expected = (COUNTS + concentration - 1) / (COUNTS + concentration - 1).sum()

@@ -61,7 +61,8 @@ def correlated():
 
 
 @pytest.mark.parametrize(
-    "guide", ["mean_field", pytest.param("low_rank", marks=pytest.mark.study), "full_rank"]
+    "guide",
+    [*(pytest.param(name, marks=pytest.mark.study) for name in ("mean_field", "low_rank")), "full_rank"],
 )
 def test_covariances_are_those_that_the_family_allows(guide):
     """Mean field: the variances are one over the precision's diagonal; the others hold the whole covariance."""

@@ -128,6 +128,7 @@ def test_one_path_is_exact():
     np.testing.assert_allclose(resultant, ratio(np.abs(eta)) * np.exp(1j * np.angle(eta)), atol=0.03)
 
 
+@pytest.mark.study
 def test_two_paths_bound_the_evidence():
     data, _ = phase_errors_data(links=1, paths=2, noise=0.5)
     response, h = data["response"][0], data["h"][0]
@@ -183,6 +184,7 @@ def enumerated(density, moments, rest, target):
     return total / 2**moments.length.size
 
 
+@pytest.mark.study
 def test_expectations_are_exact_for_couplings_of_pairs():
     def model(noise, y=None):
         with numpyro.plate("site", 5):
@@ -264,6 +266,7 @@ def first_e_steps(response, seen, times, h):
     return [start.direction, start.length, *reference_phases(target, layout, jnp.zeros(3), inputs)]
 
 
+@pytest.mark.study
 def test_least_squares_leave_out_what_is_masked_and_repeat_what_is_scaled():
     """Phases from masked or scaled observations are those from the others alone, or from each of them twice."""
     data, _ = phase_errors_data(links=1, paths=3)

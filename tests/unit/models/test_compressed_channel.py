@@ -88,7 +88,8 @@ def test_the_rival_on_powers_has_the_loss_of_the_literature(paths, statistics):
     assert (fit[1] - fit[0]) / (loss[1] - loss[0]) < 0
 
 
-@pytest.mark.parametrize("phase", ["per_path", pytest.param("per_packet", marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("phase", ["per_path", "per_packet"])
 def test_contract_on_channels(paths, statistics, phase):
     check_model(
         compressed_channel, {"paths": paths, "noise_power": 1e-9, "phase": phase, **compress(statistics)}

@@ -40,7 +40,11 @@ def graph(alarm_law):
 
 
 @pytest.mark.parametrize(
-    "law", [Logistic("weight", ("new_level",), 2), Neural("net", ("new_level",), 2, hidden=3)]
+    "law",
+    [
+        Logistic("weight", ("new_level",), 2),
+        pytest.param(Neural("net", ("new_level",), 2, hidden=3), marks=pytest.mark.study),
+    ],
 )
 def test_models_keep_their_contract(columns, law):
     check_model(graph(law), columns)

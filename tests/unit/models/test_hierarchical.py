@@ -18,6 +18,7 @@ def data():
     return arguments | {"channel": drawn["channel"]["value"], "materials": "hierarchical"}
 
 
+@pytest.mark.study
 def test_contract(data):
     check_model(ray_traced_channel, data)
 

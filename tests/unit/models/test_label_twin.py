@@ -89,12 +89,10 @@ WRONG = {
         truth + 0.5 * rng.normal(size=(4, 4))[tuple(np.floor(2 * x[:, :2] + 2).astype(int).T)]
     ),
 }
-LONG = {"stale_map", "regional_bias[x2_high]"}
 
 
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.study) if name in LONG else name for name in WRONG]
-)
+@pytest.mark.study
+@pytest.mark.parametrize("name", WRONG)
 def test_how_the_predictor_errs_is_named(name):
     data = rows(wrong=WRONG[name])
     effects = catalogue(declare(label_twin, data).sites, data)

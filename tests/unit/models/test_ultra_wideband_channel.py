@@ -115,6 +115,7 @@ def test_the_mean_over_snapshots_is_as_uncertain_as_declared(paths, traced):
     np.testing.assert_allclose(variance, (1e-3 / 4 + 0.2) * reference, rtol=1e-9)
 
 
+@pytest.mark.study
 def test_the_contract_and_the_sites_that_effects_need(paths):
     data = {"paths": paths, "subcarrier_frequency": jnp.asarray(FREQUENCY), "phase": "per_packet"}
     drawn = trace_model(ultra_wideband_channel, data, jax.random.key(1))["channel"]["value"]

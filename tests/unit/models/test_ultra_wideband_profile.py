@@ -118,6 +118,7 @@ def test_taps_spread_as_the_shape_says_about_a_mean_that_noise_raises(paths):
     np.testing.assert_allclose(law.variance, mean**2 / 2.0, rtol=1e-6)
 
 
+@pytest.mark.study
 def test_second_derivatives_hold_at_a_picowatt_in_single_precision(paths):
     """A rate of 1e13 per watt, whose second derivative by the power is beyond what single precision holds."""
 

@@ -127,6 +127,7 @@ def test_a_size_has_the_information_asked_for():
     assert information(BENCH, fault.change(BENCH.law, found.size)) == pytest.approx(60.0, rel=0.15)
 
 
+@pytest.mark.study
 def test_several_faults_can_be_told_apart():
     families = Families(lambda rng, family: draw(rng, family, SURVEY), LISTED, FOREIGN)
     for seed in range(6):

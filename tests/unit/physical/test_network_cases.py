@@ -134,6 +134,7 @@ def test_an_outage_is_remembered():
     assert share > np.mean(record((2,), NETWORK, 20_000).ack.sum(1) == 0)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("family", [None, "ack_loss", "capture", "near_far", "duty_cycle"])
 def test_an_outage_is_remembered_beside_other_faults(family):
     """The memory is the chance of an outage given the past, so that on average it is what it started with."""

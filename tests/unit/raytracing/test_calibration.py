@@ -156,6 +156,7 @@ def test_one_path_has_its_exact_posterior():
     assert float(phases.free_energy(field, found)[0, 0]) == pytest.approx(-np.log(evidence), abs=1e-7)
 
 
+@pytest.mark.study
 def test_several_starts_are_at_least_as_good_as_each():
     field = random_field(jax.random.key(7), paths=5, snapshots=30)
     starts = phases.no_error(field), phases.reference(field)
@@ -225,6 +226,7 @@ def test_runs_do_not_see_one_another(paths, uniform_runs):
         np.testing.assert_allclose(one, turned[::-1], rtol=1e-9)
 
 
+@pytest.mark.study
 def test_noise_power_and_a_common_phase_are_estimated(paths, array):
     shape = paths.n_link, 20, paths.n_path
     random = np.random.default_rng(4)
@@ -240,6 +242,7 @@ def test_noise_power_and_a_common_phase_are_estimated(paths, array):
     assert power_error(paths, found) < 0.03
 
 
+@pytest.mark.study
 def test_groups_have_materials_of_their_own(paths, array):
     groups = np.asarray(paths.object_material)
     values = np.array([3.0, 8.0, 5.0])[groups % 3]

@@ -49,6 +49,7 @@ def test_another_policy_changes_what_it_touches_only(log, posterior):
     assert not np.any(slots.delivered[:, 40:])
 
 
+@pytest.mark.study
 def test_noise_given_what_happened_is_uniform_over_slots(posterior):
     """Noise drawn, slot run, noise drawn anew given the slot: its law is the prior's. Fails once in 10^4 keys."""
     parameters = {
@@ -81,6 +82,7 @@ def test_an_episode_that_cannot_happen_is_named(log, posterior):
         what_if(jax.random.key(0), SYSTEM, PointMass(impossible), log, draws=2)
 
 
+@pytest.mark.study
 def test_the_average_effect_of_silence_is_minus_the_throughput(posterior):
     arms = Arm(random_access(4, 0.25)), Arm(random_access(4, 0.0))
     given = {"metric": throughput, "horizon": 50, "draws": 20, "episodes": 4}

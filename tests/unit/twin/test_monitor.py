@@ -43,6 +43,7 @@ def test_likelihoods_are_those_of_the_counts(learned):
     np.testing.assert_allclose(found["deliveries"], counted["log_reception"], rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.study
 def test_normal_data_seldom_alarm(monitor):
     watch = monitor.watch(windows(simulate(400, 13)))
     assert watch.alarm.mean() < 0.1 + 4 * np.sqrt(0.1 * 0.9 * (1 / 40 + 1 / 40))

@@ -44,6 +44,7 @@ def test_throughput_of_random_access_is_that_of_the_exact_chain():
     assert found.epistemic == 0.0
 
 
+@pytest.mark.study
 def test_intervals_cover_where_those_of_a_point_estimate_do_not():
     """Overflow over a horizon, foreseen from 10 slots; 60 twins, so 90% within 4 standard errors of chance."""
     horizon, slots, level, trials = 100, 10, 0.9, 60

@@ -104,6 +104,7 @@ use = ["depth_cut_off", "refraction_off", "swapped_transmitters"]
 """
 
 
+@pytest.mark.study
 @pytest.mark.libllvm
 def test_what_the_tracer_leaves_out_becomes_candidates(tmp_path):
     pytest.importorskip("sionna.rt", exc_type=ImportError)

@@ -31,7 +31,7 @@ disconnect = [[{CHANGE}, 1]]
 horizon = 350
 [loop]
 slots = 1000
-training = 40000
+training = 15000
 caution = 6.0
 diagnose = 0
 """

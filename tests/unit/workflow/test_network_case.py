@@ -49,6 +49,7 @@ def case(folder, engine="laplace", options="window = 10"):
     return load_case(folder / "case.toml")
 
 
+@pytest.mark.study
 def test_a_fit_is_summarised(folder):
     prepared = prepare(case(folder, "exact"), need="fit")
     posterior = prepared.engine(prepared.key, prepared.model, prepared.data)

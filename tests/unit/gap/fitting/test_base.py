@@ -112,6 +112,7 @@ def echo(distance, frequency, channel=None):
         numpyro.sample("channel", ComplexNormal(expected, 1e-4), obs=channel)
 
 
+@pytest.mark.study
 def test_a_fit_that_crawls_along_a_ridge_is_followed_to_its_end():
     rng = np.random.default_rng(5)
     distance, frequency = rng.uniform(1, 3, 20), 6e9 + np.linspace(-5e7, 5e7, 12)

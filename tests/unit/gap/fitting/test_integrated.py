@@ -130,7 +130,8 @@ def test_a_volume_is_what_its_derivatives_say():
     np.testing.assert_allclose(volume.bend, np.tile(bend, (20, 1, 1)), atol=0.02)
 
 
-@pytest.mark.parametrize("drop", [0.0, pytest.param(2.0, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("drop", [0.0, 2.0])
 def test_a_state_for_every_reading_is_no_gap(drop):
     """The joint mode lets the noise vanish, and all that is random would look like a gap."""
     told = []

@@ -67,6 +67,7 @@ def drawn(links, readings, seed, few=()):
     return {"x": jnp.asarray(x), "seen": jnp.asarray(seen), "y": jnp.asarray(y)}
 
 
+@pytest.mark.study
 def test_squares_are_lower_by_the_leverage():
     """Mean of the rows at modes of the levels, over data sets, with the noise as it is."""
     few, sets, rows = range(15), 20, 0.0
@@ -109,9 +110,8 @@ def test_scores_are_those_of_generalised_least_squares():
     np.testing.assert_allclose(projection.information(w)[0], information, rtol=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("links", "readings", "few"), [(400, 5, 0), pytest.param(300, 10, 150, marks=pytest.mark.study)]
-)
+@pytest.mark.study
+@pytest.mark.parametrize(("links", "readings", "few"), [(400, 5, 0), (300, 10, 150)])
 def test_many_small_clusters_ring_no_alarm(links, readings, few):
     which = np.arange(links) < links // 2
     data = drawn(links, readings, 7, range(few))
@@ -134,6 +134,7 @@ def of_two_kinds(device, warm, time=None, frequency=None):
         numpyro.sample("frequency", dist.Normal(offset, noise["frequency"]), obs=frequency)
 
 
+@pytest.mark.study
 def test_what_levels_take_is_taken_from_the_site_that_they_act_on():
     """Where observed sites are not in the order of the alphabet it was given to another: 11 of 11 right twins rang."""
     rng = np.random.default_rng(0)
@@ -261,9 +262,8 @@ def test_what_is_lost_is_the_slope_of_the_curvature_of_own_unknowns(law):
     assert (rows[is_location] == 0).all()
 
 
-@pytest.mark.parametrize(
-    "law", ["Normal", *(pytest.param(law, marks=pytest.mark.study) for law in ("Gamma", "Poisson"))]
-)
+@pytest.mark.study
+@pytest.mark.parametrize("law", ["Normal", "Gamma", "Poisson"])
 def test_scores_beside_levels_within_an_exponential_have_mean_zero(law):
     """z of a candidate that adds to the site, and of the site itself, over data sets without it."""
     z, p = [], []

@@ -213,7 +213,9 @@ def test_a_cause_is_charged_for_its_choice_beside_a_model_of_the_rest_too():
     ("shift", "loudness", "options"),
     [
         (levels, 1.0, {}),
-        (0.0, loud, {"site": "deviation", "kind": "relative", "spread": 0.5}),
+        pytest.param(
+            0.0, loud, {"site": "deviation", "kind": "relative", "spread": 0.5}, marks=pytest.mark.study
+        ),
     ],
 )
 def test_what_is_each_clusters_own_widens_the_prediction(shift, loudness, options):

@@ -64,7 +64,8 @@ def test_what_changes_across_a_turn_keeps_its_edge():
     assert unrolled(model, readings(0.0, 0)) is model
 
 
-@pytest.mark.parametrize("shift", [pytest.param(0.0, marks=pytest.mark.study), 0.25])
+@pytest.mark.study
+@pytest.mark.parametrize("shift", [0.0, 0.25])
 def test_phases_all_round_the_circle(shift):
     """Of the right twin a fit had no finite likelihood, or users stuck at an end were a gap."""
     found = diagnose(

@@ -213,9 +213,8 @@ def test_other_control_flow_is_left_as_it_is():
     assert site["sign"]["value"] == 1.0
 
 
-@pytest.mark.parametrize(
-    "kind", ["state", *(pytest.param(kind, marks=pytest.mark.study) for kind in ("walk", "curve"))]
-)
+@pytest.mark.study
+@pytest.mark.parametrize("kind", ["state", "walk", "curve"])
 def test_what_all_clusters_share_of_a_series_is_no_gap(kind):
     """Its joint mode with the spread would be a flat line, and every hour wrong."""
     found = diagnose(

@@ -37,6 +37,7 @@ def kinds(model, **data):
     return {n: sites[n].dtype.kind for n in problem.declaration.deterministic}
 
 
+@pytest.mark.study
 def test_whole_numbers_are_diagnosed_as_real_ones():
     y = X + 0.5 + 0.4 * RNG.normal(size=N)
     found = [

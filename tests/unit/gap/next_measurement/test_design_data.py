@@ -239,6 +239,7 @@ def test_a_diagnosis_recommends_what_splits_its_class():
     assert after.causes[0].effects == ("bend_2",)
 
 
+@pytest.mark.study
 def test_signs_of_an_effect_that_the_data_do_not_confirm_are_decided_against_the_twin_as_it_is():
     """Of a parabola the ends and the middle tell most; measured as often as it is said they confirm it."""
     x = np.linspace(0.3, 2.0, 40)

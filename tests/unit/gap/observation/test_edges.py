@@ -86,6 +86,7 @@ def test_an_angle_that_may_be_anything():
         assert all(np.isfinite(np.asarray(v)).all() for v in moved.parameters.values())
 
 
+@pytest.mark.study
 def test_a_part_of_a_mixture_that_never_comes():
     """The mixture is its other part, whatever this one is."""
     value = jnp.asarray([0.3, -1.0, 2.0])

@@ -99,6 +99,7 @@ def test_what_is_wrong_with_complex_noise_is_named(noise, expected):
     assert not first.last
 
 
+@pytest.mark.study
 def test_nothing_is_noticed_where_nothing_is_wrong():
     """Each of 150 other replicates taken as the data: no more small p-values than chance lets there be."""
     problem, fitted, _, drawn, _ = replicated(circular)

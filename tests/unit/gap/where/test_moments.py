@@ -270,6 +270,7 @@ def test_delays_of_another_law_are_noticed_by_their_shape(law):
     assert {f.moment for f in found.sites if f.p_value < 0.0025} & {"skewness", "tails"}
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("law", LAWS)
 def test_delays_of_their_own_law_are_not(law):
     p = [waited(law, WAITING[law][1].rvs(size=(40, 25), random_state=seed)).site_p_value for seed in range(4)]

@@ -32,7 +32,8 @@ def sight(route, distance, loss=None):
         )
 
 
-@pytest.mark.parametrize("slope", [pytest.param(0.0, marks=pytest.mark.study), 6.0])
+@pytest.mark.study
+@pytest.mark.parametrize("slope", [0.0, 6.0])
 def test_how_often_parts_come_is_looked_at(slope):
     """A chance that falls with the distance was NO_GAP at 100 nats: no site that the model names tells of it."""
     rng = np.random.default_rng(0)

@@ -42,6 +42,7 @@ SHADOWING = Effect(
 )
 
 
+@pytest.mark.study
 def test_a_sampler_draws_the_accepted_fields_too():
     """Without them links were independent readings, and the interval of the offset half as wide."""
     rng = np.random.default_rng(1)

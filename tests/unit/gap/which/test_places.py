@@ -160,6 +160,7 @@ def test_a_random_field_pays_for_its_place(looked):
     np.testing.assert_allclose(free.log_bayes_factor - seen.log_bayes_factor, found["gusty"].price, rtol=1e-9)
 
 
+@pytest.mark.study
 def test_a_random_field_with_a_place_imitates_nothing(looked):
     """Where it was found the search does not start again without it."""
     heights = 1.5 * np.random.default_rng(5).normal(size=(len(inputs()), 1))

@@ -43,7 +43,9 @@ def test_mean(rival, lam):
     np.testing.assert_allclose([found.low[0], found.high[0]], interval, atol=0.02 * np.ptp(interval))
 
 
-@pytest.mark.parametrize("loss", ["ols", "logistic", "poisson"])
+@pytest.mark.parametrize(
+    "loss", ["ols", *(pytest.param(name, marks=pytest.mark.study) for name in ("logistic", "poisson"))]
+)
 @pytest.mark.parametrize("lam", [None, pytest.param(1.0, marks=pytest.mark.study)])
 def test_regression(rival, loss, lam):
     sample = one_predictor(linear(n=120, kind=loss))

@@ -36,6 +36,7 @@ def test_intervals_agree_with_the_sandwich(engine):
     np.testing.assert_allclose((high - found.high) / half, 0, atol=0.2)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("calibration", ["matrix", "scalar"])
 def test_the_mode_and_the_width_are_calibrated(case, calibration):
     sample, found = case

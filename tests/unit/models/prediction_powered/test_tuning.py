@@ -46,6 +46,7 @@ def test_the_guard_pulls_useless_lambdas_towards_zero():
     assert np.mean(guarded.value**2) < 0.6 * np.mean(plain.value**2)
 
 
+@pytest.mark.study
 def test_the_standard_error_of_lambda_is_its_spread():
     found = lambdas("useless", Practice(), runs=1000, n=200)
     # The standard deviation over 1000 runs is known to 2.2%; 15% leaves room for the delta method.
