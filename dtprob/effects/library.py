@@ -69,8 +69,36 @@ def catalogue(sites: Sites, data: Data, use: str | Iterable[str | Effect] = "all
         return _unique([effect for family in FAMILIES for effect in _offered(family, sites, data)])
     chosen: list[Effect] = []
     for entry in [use] if isinstance(use, str) else use:
-        chosen += [_checked(entry, sites)] if isinstance(entry, Effect) else _named(entry, sites, data)
+        if isinstance(entry, Effect):
+            check_sites(entry, sites)
+        chosen += [entry] if isinstance(entry, Effect) else _named(entry, sites, data)
     return _unique(chosen)
+
+
+def check_sites(effect: Effect, sites: Sites) -> None:
+    """Look whether an effect finds its sites, values to rewrite and distributions to replace.
+
+    Raises:
+        InputError: the model lacks one, or has it as something else.
+    """
+    remedies = {
+        "a site": (
+            [site for site in effect.sites if site not in sites],
+            "Name it with numpyro.deterministic in the model, or leave the effect out.",
+        ),
+        "a value that the model draws or computes": (
+            [site for site in effect.rewrites if site in sites and sites[site].kind == "observed"],
+            "What is observed has a distribution that an effect can replace: `distributions`, not `rewrites`.",
+        ),
+        "a site that has a distribution": (
+            [site for site in effect.distributions if site in sites and sites[site].kind == "deterministic"],
+            "What the model computes has a value that an effect can rewrite: `rewrites`, not `distributions`.",
+        ),
+    }
+    for what, (wrong, remedy) in remedies.items():
+        if wrong:
+            expected = f"{what} among {', '.join(sites)}"
+            raise InputError(f"effect {effect.name}", expected, ", ".join(wrong), remedy)
 
 
 def summaries() -> dict[str, str]:
@@ -108,18 +136,6 @@ def _named(name: str, sites: Sites, data: Data) -> list[Effect]:
         repr(name),
         f"Did you mean {close!r}?" if close else "Leave it out, or give the sites and data that it needs.",
     )
-
-
-def _checked(effect: Effect, sites: Sites) -> Effect:
-    missing = [site for site in effect.sites if site not in sites]
-    if missing:
-        raise InputError(
-            f"effect {effect.name}",
-            f"sites among {', '.join(sites)}",
-            ", ".join(missing),
-            "Name the site in the model, or leave the effect out.",
-        )
-    return effect
 
 
 def _unique(effects: list[Effect]) -> tuple[Effect, ...]:

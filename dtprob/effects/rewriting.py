@@ -15,6 +15,7 @@ import numpyro.distributions as dist
 from dtprob.effects.changing import Changing, is_scanned
 from dtprob.effects.distributions import replace_base
 from dtprob.effects.effect import FIELD, Context, Effect, Model
+from dtprob.effects.redrawn import drawn_apart
 from dtprob.errors import InputError
 
 _ADDED = "__dtprob_effects__"
@@ -181,9 +182,10 @@ def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
     Effects apply in the order listed, and those of the model that is extended before those of the extension,
     so nesting makes no difference: with_effects(with_effects(m, a), b) has the sites of
     with_effects(m, a + b) with the same values and densities. The order matters where several effects
-    rewrite one site.
+    rewrite one site. What the model draws and an effect rewrites is drawn apart; see `drawn_apart`.
     """
     effects, signature = tuple(effects), inspect.signature(model)
+    rewritten_sites = {site for effect in effects for site in effect.rewrites}
 
     @functools.wraps(model)
     def extended(*args: Any, **data: Any) -> Any:
@@ -194,7 +196,7 @@ def with_effects(model: Model, effects: Sequence[Effect]) -> Model:
             }
             for effect in effects
         }
-        with Rewriting(None, effects, parameters, data):
+        with Rewriting(None, effects, parameters, data), drawn_apart(rewritten_sites):
             return model(**data)
 
     extended.__signature__ = signature  # pyright: ignore[reportAttributeAccessIssue]

@@ -12,9 +12,10 @@ import numpyro
 from numpyro import handlers
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.effects.redrawn import drawn_apart
 from dtprob.effects.rewriting import Rewriting, may_become
 from dtprob.gap.model.whole_numbers import real_sites
-from dtprob.models.arguments import Model, as_arrays
+from dtprob.models.arguments import Model, as_arrays, within
 from dtprob.testing.contract import expect, same
 
 type Trace = Mapping[str, Mapping[str, Any]]
@@ -47,11 +48,15 @@ def check_effect(
     for parameter in effect.parameters:
         _check_parameter(f"{what}, parameter {parameter.name!r}", parameter, key)
     with numpyro.validation_enabled(False):  # values that are not finite are for the checks to find
-        model = real_sites(model, as_arrays(data))  # as a diagnosis takes it
+        whole = real_sites(model, as_arrays(data))  # as a diagnosis takes it
+        model = within(whole, lambda: drawn_apart(effect.rewrites))
         plain = _run(model, data, key)
         for site in effect.sites:
             remedy = "Give it to models that have it"
             expect(site in plain, what, f"a site {site!r} of the model", "none", remedy)
+        for site in effect.rewrites:
+            got, remedy = "one that is observed", "Replace its distribution: distributions, not rewrites"
+            expect(not plain[site].get("is_observed"), what, f"a value {site!r} to rewrite", got, remedy)
         _check_null(what, effect, model, data, key, plain)
         _check_away(what, effect, model, data, key, plain)
         _check_derivative(what, effect, model, data, key, plain)

@@ -7,7 +7,7 @@ random walks, Gaussian processes and the states of a `scan`.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection
 from typing import Any
 
 import equinox as eqx
@@ -16,12 +16,10 @@ import jax.numpy as jnp
 import numpyro
 import numpyro.distributions as dist
 from jax.core import Tracer
-from numpyro import handlers
 from numpyro.distributions import constraints
 from numpyro.infer.reparam import LocScaleReparam, Reparam
-from numpyro.primitives import Messenger
 
-from dtprob.effects.changing import is_scan
+from dtprob.effects.redrawn import Redrawn
 from dtprob.models.arguments import Data, Model, split_static, within
 from dtprob.models.declaration import base_constraint, trace_model
 from dtprob.wrapping import unwrapped
@@ -39,19 +37,6 @@ class _Whitened(Reparam):
         if isinstance(own, dist.MultivariateNormal):
             return None, jnp.asarray(own.loc) + jnp.einsum("...ij,...j->...i", own.scale_tril, z)
         return None, jnp.cumsum(_spread(own)[..., None] * z, axis=-1)
-
-
-class _Inside(Messenger):
-    """Redraws sites in the bodies of scans, too."""
-
-    def __init__(self, ways: Mapping[str, Reparam]) -> None:
-        super().__init__(None)
-        self._ways = ways
-
-    def process_message(self, msg: dict[str, Any]) -> None:  # pyright: ignore[reportIncompatibleMethodOverride]
-        if is_scan(msg):
-            body, *rest = msg["args"]
-            msg["args"] = (handlers.reparam(body, config=dict(self._ways)), *rest)
 
 
 def decentred(model: Model, data: Data, shared: Collection[str], own: Collection[str] = ()) -> Model:
@@ -80,10 +65,7 @@ def decentred(model: Model, data: Data, shared: Collection[str], own: Collection
         return model
     told = jax.jit(jax.vmap(spreads, in_axes=(0, None)))(jax.random.split(jax.random.key(0)), arrays)
     ways = {n: way for n, way in ways.items() if bool((told[n][0] != told[n][1]).any())}
-    if not ways:
-        return model
-
-    return within(within(model, lambda: handlers.reparam(config=ways)), lambda: _Inside(ways))
+    return within(model, lambda: Redrawn(ways)) if ways else model
 
 
 def _way(fn: Any) -> Reparam | None:

@@ -1,8 +1,8 @@
 """Which unknowns of a model have an entry for each cluster, so that a fit can find and integrate them cluster by cluster.
 
-Where an axis of the model makes the clusters, the plate of that name tells which entries may be; where a column of the
-data does, as in `level[site]` with clusters by `site`, any may. The model is asked in either case: an entry belongs to a
-cluster if nothing else depends on it, which is not so of independent draws that are made into a Gaussian process.
+Where an axis of the model makes the clusters, entries along any axis of that size may be, in that order; where a column of
+the data does, as in `level[site]` with clusters by `site`, in the order of rows or by number. The model is asked: an entry
+belongs to a cluster if nothing else depends on it, which is not so of independent draws made into a Gaussian process.
 """
 
 from __future__ import annotations
@@ -53,15 +53,23 @@ def of_latents(problem: Problem) -> dict[str, Own]:
     blocks = problem.blocks_of(None)
     if problem.column is not None:
         return _moved_along_column(problem, blocks)
-    named = along_axis(problem.declaration, {b.name: b.shape for b in blocks}, problem.n_cluster)
-    if not named:
-        return {}
+    count = problem.n_cluster
+    named = along_axis(problem.declaration, {b.name: b.shape for b in blocks}, count)
+    wide = {b.name: b.index.reshape(b.shape) for b in blocks if count in b.shape and count > 1}
+    if not wide:
+        return named
     told, x = _densities(problem), problem.prior_draws(jax.random.key(0), 1)[0]
     likelihood, prior = told(x)
     if not np.isfinite([*likelihood, prior]).all():
         return named
-    wide = {b.name: b.index.reshape(b.shape) for b in blocks if b.name in named}
-    return {n: own for n, own in named.items() if _belong(own.arranged(wide[n]), x, told)}
+    found: dict[str, Own] = {}
+    for name, index in wide.items():
+        axes = [named[name].axis] if name in named else [i for i, n in enumerate(index.shape) if n == count]
+        tries = (Own(axis, np.arange(count)) for axis in axes)
+        own = next((one for one in tries if _belong(one.arranged(index), x, told)), None)
+        if own is not None:
+            found[name] = own
+    return found
 
 
 def of_fields(problem: Problem) -> dict[str, Own]:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dtprob.effects.redrawn import DRAWN
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import transform_of
 from dtprob.gap.model.quick import quick_jit
@@ -56,6 +57,7 @@ class Prior:
     ) -> dict[str, np.ndarray]:
         """Unconstrained draws (n, size) of those of some sites that a reference knows."""
         draws = reference.sample(jax.random.key(0), n)
-        chosen = {name: jnp.asarray(draws[name]) for name in names if name in draws}
+        called = {name: name if name in draws else name.removesuffix(DRAWN) for name in names}
+        chosen = {name: jnp.asarray(draws[own]) for name, own in called.items() if own in draws}
         flat = jax.vmap(self.unconstrained, in_axes=(0, None))(chosen, arrays)
         return {name: np.asarray(value) for name, value in flat.items()}

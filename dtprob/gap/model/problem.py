@@ -18,6 +18,8 @@ import numpy as np
 from scipy import special
 
 from dtprob.effects.effect import FIELD, Effect
+from dtprob.effects.library import check_sites
+from dtprob.effects.redrawn import drawn_apart
 from dtprob.errors import InputError
 from dtprob.gap.model import own
 from dtprob.gap.model.angles import unrolled
@@ -37,7 +39,7 @@ from dtprob.gap.model.volume import Volume
 from dtprob.gap.model.whole_numbers import real_sites
 from dtprob.gap.observation import whiten
 from dtprob.inference.posterior import Sampler
-from dtprob.models.arguments import Data, Model, as_arrays, split_static
+from dtprob.models.arguments import Data, Model, as_arrays, split_static, within
 from dtprob.models.declaration import Declaration, declare
 from dtprob.models.supported import check_supported
 
@@ -83,14 +85,17 @@ class Problem:
         if model is not self.model:
             self._declare(model, static)
         self._check_effects()
+        changed = {s for effect in effects for s in effect.rewrites} & self.declaration.latent.keys()
+        if changed:
+            self._declare(within(self.model, lambda: drawn_apart(changed)), static)
         self.known: Known = {}
         self.per_cluster: frozenset[str] = frozenset()
         self.volume: Volume | None = None
         self._find_own()
         shared = self.declaration.latent.keys() - self.own.keys()
-        drawn = model if reference is not None else decentred(model, data, shared, self.own)
+        drawn = self.model if reference is not None else decentred(self.model, data, shared, self.own)
         latent = set(self.declaration.latent)
-        if drawn is not model:
+        if drawn is not self.model:
             self._declare(drawn, static)
             self._find_own()
         self.decentred: frozenset[str] = frozenset(self.declaration.latent.keys() - latent - self.own.keys())
@@ -219,14 +224,7 @@ class Problem:
             if names.count(effect.name) > 1:
                 remedy = "Give each effect a name of its own"
                 raise InputError("effects", "one of each name", f"several named {effect.name!r}", remedy)
-            missing = [site for site in effect.sites if site not in self.declaration.sites]
-            if missing:
-                raise InputError(
-                    f"effect {effect.name}",
-                    f"a site among {', '.join(self.declaration.sites)}",
-                    ", ".join(missing),
-                    "Name the site with numpyro.deterministic in the model, or leave the effect out",
-                )
+            check_sites(effect, self.declaration.sites)
 
     # -- sizes and names ------------------------------------------------------------------------------------------
 

@@ -122,11 +122,16 @@ def _largest(
         for site in effect.rewrites:
             new = rewritten(effect, site, values[site], parameters, Context(data, before[site]))
             try:
-                shapes[site] = np.broadcast_shapes(shapes[site], jnp.shape(new))
+                grown = np.broadcast_shapes(shapes[site], jnp.shape(new))
             except ValueError:
                 what, wanted = f"effect {effect.name}", f"site {site!r} of a shape that fits {shapes[site]}"
                 remedy = "Return a value for each entry of the site, or one for all"
                 raise InputError(what, wanted, f"{jnp.shape(new)}", remedy) from None
+            if len(grown) > len(shapes[site]):
+                what, wanted = f"effect {effect.name}", f"site {site!r} with {len(shapes[site])} axes"
+                remedy = f"Let the model compute it for each entry: numpyro.deterministic(..., {site} * jnp.ones({grown}))"
+                raise InputError(what, wanted, f"{len(grown)}, of shape {jnp.shape(new)}", remedy)
+            shapes[site] = grown
     return shapes
 
 

@@ -20,7 +20,8 @@ _CHANCE: Final = 0.01
 def foremost(named: FamilyTest, tests: Sequence[FamilyTest], site: Site) -> str | None:
     """The place of the entry that brings most of what is wrong, in words; None where several do, or where it has none.
 
-    One far reading shows in every ripple, so that where the family that is named has no such entry, single ones are asked.
+    One far reading shows in every ripple, so that where the family that is named has no such entry, single ones are asked,
+    if these are wrong by themselves: of thousands of readings the farthest one is far, and of rare outcomes very far.
 
     Args:
         named: the test of the family that is named.
@@ -28,12 +29,14 @@ def foremost(named: FamilyTest, tests: Sequence[FamilyTest], site: Site) -> str 
         site: that they perturb.
     """
     single = (t for t in tests if t.family.kind == named.family.kind and t.family.pattern.curves is None)
-    found = (_entry(test, site) for test in (named, *sorted(single, key=lambda t: -len(t.variance))))
+    wrong = (test for test in single if test.p_value <= _CHANCE)
+    whole = float((named.told - named.seen).sum())
+    found = (_entry(test, site, whole) for test in (named, *sorted(wrong, key=lambda t: -len(t.variance))))
     return next((place for place in found if place is not None), None)
 
 
-def _entry(test: FamilyTest, site: Site) -> str | None:
-    """The entry of one family."""
+def _entry(test: FamilyTest, site: Site, whole: float) -> str | None:
+    """The entry of one family that brings most of its excess and of the whole one, that of the family that is named."""
     curves = test.family.pattern.curves
     if curves is not None and (curves.overlaps or not curves.places):
         return None
@@ -41,7 +44,7 @@ def _entry(test: FamilyTest, site: Site) -> str | None:
     told, seen = (entries.reshape(-1, parts).sum(axis=1) for entries in (test.told, test.seen))
     top, excess = int(told.argmax()), told - seen
     by_chance = len(told) * stats.chi2.sf(told[top], max(int(seen[top]), 1))
-    if len(told) < 2 or excess[top] < _MOST * excess.sum() or by_chance > _CHANCE:
+    if len(told) < 2 or excess[top] < _MOST * max(float(excess.sum()), whole) or by_chance > _CHANCE:
         return None
     return _words(test, site, top, len(told))
 

@@ -165,7 +165,7 @@ def test_choosing_by_name(world):
         (["gain_offset", "gain_offset"], "gain_offset twice"),
         (
             [Effect("bad", {"tau": USER.rewrites["path_gain"]}, USER.parameters)],
-            "effect bad: expected sites among",
+            "effect bad: expected a site among",
         ),
     ],
 )

@@ -197,7 +197,7 @@ def test_effects_that_do_nothing_are_named():
 @pytest.mark.parametrize(
     ("old", "new", "text"),
     [
-        ('{"mean":', '{"men":', "effect bias: expected sites among slope, mean, y, got men."),
+        ('{"mean":', '{"men":', "effect bias: expected a site among slope, mean, y, got men."),
         ("slope * x", "jnp.log(-1 - slope**2) * x", "base model line, site mean: expected finite values"),
         (
             "dist.Normal(0.0, 10.0))",

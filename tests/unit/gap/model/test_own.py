@@ -30,6 +30,14 @@ def independent(y=None):
     observe(level, y)
 
 
+def elsewhere(y=None):
+    """The levels' plate has another name, and other levels of that many entries act the other way round."""
+    with numpyro.plate("where it is", LINKS):
+        level = numpyro.sample("level", dist.Normal(0.0, 2.0))
+        other = numpyro.sample("other", dist.Normal(0.0, 2.0))
+    observe(level + other[::-1], y)
+
+
 def process(y=None):
     """Independent draws in the links' plate that are made into a Gaussian process along them."""
     with numpyro.plate("link", LINKS):
@@ -50,7 +58,9 @@ def data(seed):
     return {"y": jnp.asarray(level[:, None] + NOISE * rng.standard_normal((LINKS, READINGS)))}
 
 
-@pytest.mark.parametrize(("made", "own"), [(independent, {"level"}), (process, set()), (joint, set())])
+@pytest.mark.parametrize(
+    ("made", "own"), [(independent, {"level"}), (elsewhere, {"level"}), (process, set()), (joint, set())]
+)
 def test_an_entry_belongs_to_a_cluster_if_nothing_else_depends_on_it(made, own):
     assert set(Problem(made, data(0), []).own) == own
 

@@ -79,3 +79,20 @@ def test_a_report_says_which_group_or_reading_it_is(which, place):
     assert found.verdict == "UNLISTED"
     assert {one.get("place") for one in found.to_report()["unlisted"]["located"]} == {place}
     assert found.summary.endswith(f"; most of it at {place}.")
+
+
+def test_a_far_reading_is_no_place_where_single_ones_are_not_wrong_or_something_else_is_more_so():
+    """Of readings of a heavy tail one is far; where a block of them is off it brings little of what is wrong."""
+    site = SimpleNamespace(axes=("link", "antenna"), value=np.ones((60, 1)))
+    alone = np.random.default_rng(0).normal(size=60)
+    alone[17] = 9.0
+    blocks = Curves("by block", np.eye(4), places=("a", "b", "c", "d"))
+
+    def tested(scores, found, p_value):
+        family = Family("additive", Pattern("so", (0,), found), np.ones(()))
+        return FamilyTest(family, p_value, np.ones(9), np.stack([scores] * 9), np.ones(len(scores)))
+
+    even, far = np.array([5.0, 5.0, 0.0, 1.0]), np.array([9.0, -9.0, 0.0, 1.0])
+    assert foremost(tested(even, blocks, 1e-9), [tested(alone, None, 1e-9)], site) == "link 17"
+    assert foremost(tested(even, blocks, 1e-9), [tested(alone, None, 0.2)], site) is None
+    assert foremost(tested(far, blocks, 1e-9), [tested(alone, None, 1e-9)], site) is None
