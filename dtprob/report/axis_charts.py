@@ -8,7 +8,7 @@ from dtprob.report.chart import Chart, group
 from dtprob.report.json_schema import Report, is_quiet
 from dtprob.report.names import capital, words
 from dtprob.report.svg import inline_svg
-from dtprob.report.units import number, scale_for
+from dtprob.report.units import number
 
 _BEFORE, _AFTER = "gap_", "gap_after_"
 _FOUND, _EXPECTED = "closed_", "closed_expected_"
@@ -62,15 +62,14 @@ def _difference_chart(data: xr.Dataset, index: int) -> Chart:
 
 def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) -> Chart:
     shown = data[[name for name in (_BEFORE + axis, _AFTER + axis) if name in data and data[name].count()]]
-    place, unit = _places(shown[_BEFORE + axis], axis)
-    complete = shown.assign_coords(place=(axis, place)).dropna(axis)
+    complete = shown.assign_coords(place=(axis, np.arange(shown.sizes[axis]))).dropna(axis)
     before, after, place = complete[_BEFORE + axis], complete.get(_AFTER + axis), complete["place"].values
-    name, limit = capital(words(axis)), before.attrs.get("threshold") or usual_limit(before.size)
+    name, limit = capital(words(axis)), usual_limit(before.size)
     figure = coordinate_map(
         place,
         before.values,
         None if after is None else after.values,
-        label=f"{name} ({unit})" if unit else name,
+        label=name,
         threshold=limit,
     )
     told = f"Gap over {words(axis)}: {_peak(before.values, place, 'before')}"
@@ -91,22 +90,9 @@ def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) 
     return Chart(inline_svg(figure, f"{told}."), caption)
 
 
-def _places(values: xr.DataArray, axis: str) -> tuple[np.ndarray, str]:
-    """Coordinates in human units; without coordinates, their number."""
-    if axis not in values.coords:
-        return np.arange(values.size), ""
-    coordinate = values.coords[axis]
-    unit = str(coordinate.attrs.get("units", ""))
-    if not unit or not np.issubdtype(coordinate.dtype, np.number):
-        return coordinate.values, unit
-    scale = scale_for([float(np.abs(coordinate.values).max())], unit)
-    return coordinate.values * scale.factor, scale.unit
-
-
 def _peak(values: np.ndarray, place: np.ndarray, name: str) -> str:
     top = int(np.argmax(values))
-    where = number(float(place[top])) if np.issubdtype(place.dtype, np.number) else str(place[top])
-    return f"{name}, the highest excess is {number(float(values[top]))} standard deviations at {where}"
+    return f"{name}, the highest excess is {number(float(values[top]))} standard deviations at {place[top]}"
 
 
 def _axes(data: xr.Dataset, prefix: str) -> list[str]:
@@ -126,11 +112,8 @@ def closed_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
 
 
 def _closed_chart(data: xr.Dataset, axis: str) -> Chart:
-    place, unit = _places(data[_FOUND + axis], axis)
-    if not np.issubdtype(place.dtype, np.number):
-        place = np.arange(place.size)
-    parts = np.array_split(np.arange(place.size), min(place.size, _GROUPS))
-    middle = np.array([place[part].mean() for part in parts])
+    parts = np.array_split(np.arange(data.sizes[axis]), min(data.sizes[axis], _GROUPS))
+    middle = np.array([part.mean() for part in parts])
     found, expected = (
         np.array([100 * data[name + axis].values[part].sum() for part in parts])
         for name in (_FOUND, _EXPECTED)
@@ -138,7 +121,7 @@ def _closed_chart(data: xr.Dataset, axis: str) -> Chart:
     spread = np.sqrt(2 * np.maximum(expected, 0) / 100 / float(data[_FOUND + axis].attrs["nats"]))
     reach = 100 * usual_limit(len(parts)) * spread
     name, far = capital(words(axis)), np.abs(found - expected) > reach
-    figure = share_map(middle, found, expected, reach, label=f"{name} ({unit})" if unit else name)
+    figure = share_map(middle, found, expected, reach, label=name)
     most = int(np.argmax(expected))
     told = (
         f"What the cause closes over {words(axis)}: most at {number(float(middle[most]))}, where it should be "

@@ -54,22 +54,14 @@ def of_latents(problem: Problem) -> dict[str, Own]:
     if problem.column is not None:
         return _moved_along_column(problem, blocks)
     count = problem.n_cluster
-    named = along_axis(problem.declaration, {b.name: b.shape for b in blocks}, count)
-    wide = {b.name: b.index.reshape(b.shape) for b in blocks if count in b.shape and count > 1}
+    wide = {b.name: b.index.reshape(b.shape) for b in blocks if count in b.shape}
     if not wide:
-        return named
+        return {}
     told, x = _densities(problem), problem.prior_draws(jax.random.key(0), 1)[0]
     likelihood, prior = told(x)
     if not np.isfinite([*likelihood, prior]).all():
-        return named
-    found: dict[str, Own] = {}
-    for name, index in wide.items():
-        axes = [named[name].axis] if name in named else [i for i, n in enumerate(index.shape) if n == count]
-        tries = (Own(axis, np.arange(count)) for axis in axes)
-        own = next((one for one in tries if _belong(one.arranged(index), x, told)), None)
-        if own is not None:
-            found[name] = own
-    return found
+        return along_axis(problem.declaration, {b.name: b.shape for b in blocks}, count)
+    return _asked(wide, count, [np.arange(count)], x, told)
 
 
 def of_fields(problem: Problem) -> dict[str, Own]:
@@ -130,6 +122,17 @@ def along_column(
     orders = [np.arange(count)]
     if np.issubdtype(values.dtype, np.number) and np.array_equal(np.sort(values), np.arange(count)):
         orders.insert(0, values.astype(int))
+    return _asked(unknowns, count, orders, x, told)
+
+
+def _asked(
+    unknowns: Mapping[str, Int[np.ndarray, "*shape"]],
+    count: int,
+    orders: Iterable[Int[np.ndarray, " cluster"]],
+    x: Float[np.ndarray, " dimension"],
+    told: LogDensities,
+) -> dict[str, Own]:
+    """Those of the unknowns whose entries along an axis of that many belong to the clusters in one of some orders."""
     found: dict[str, Own] = {}
     for name, index in unknowns.items():
         axes = [i for i, n in enumerate(index.shape) if n == count]
