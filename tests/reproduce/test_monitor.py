@@ -18,6 +18,7 @@ def test_windows_are_all_and_weighed():
         np.testing.assert_allclose(windows.probability(law) @ windows.counts, 5 * law, atol=1e-12)
 
 
+@pytest.mark.study
 def test_the_best_detector_bounds_all():
     """Neyman and Pearson: no statistic has a larger area than the likelihood ratio of the true laws."""
     windows = monitor.Windows(5)

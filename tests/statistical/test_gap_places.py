@@ -33,6 +33,7 @@ def chance():
     return of
 
 
+@pytest.mark.study
 def test_a_best_place_by_chance_is_paid_for(chance):
     p = np.array([chance(0.0, seed) for seed in range(1, 121)])
     for level in (0.02, 0.05, 0.2):

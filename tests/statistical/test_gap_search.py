@@ -54,7 +54,8 @@ def look(data, seed):
     return search(problem, fit_base(problem, key), key, SETTINGS, print).steps
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [0, 1])
 def test_a_first_choice_made_for_two_effects_is_taken_back(seed):
     steps = look(rows(seed, shift=lambda x: 0.9 * np.sin(3 * x) + 0.6 * np.sin(5 * x)), seed)
     assert steps[0].accepted == "both"

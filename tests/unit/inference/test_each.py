@@ -48,6 +48,7 @@ def test_the_same_draws_as_alone_but_for_rounding(engine):
         np.testing.assert_array_equal(together.observed["y"][number], alone.observed["y"])
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("engine", ["nuts", "hmc"])
 def test_each_has_its_own_posterior(engine, tmp_path):
     """Means against the closed form: 40 z-scores, all below 4.5 (failure rate 3e-4); and the layout, kept on disk."""

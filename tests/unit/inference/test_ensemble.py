@@ -86,6 +86,7 @@ def test_weights_leave_the_reported_likelihood_alone():
     np.testing.assert_allclose(posterior.log_likelihood["y"], expected)
 
 
+@pytest.mark.study
 def test_angles_and_discrete_data():
     posterior = Ensemble(members=64)(KEY, at_the_cut, at_the_cut_data())
     eta = 3.0 * np.exp(1j * at_the_cut_data()["y"]).sum() + 0.05

@@ -29,6 +29,7 @@ def posterior(arguments):
     return Exact(draws=4000)(KEY, multi_access, arguments)
 
 
+@pytest.mark.study
 def test_counts_are_found_from_the_model(arguments, posterior):
     for name, counts in window_counts(arguments).items():
         free = (priors(arguments["clusters"], 1.0)[name] > 0).sum(axis=-1, keepdims=True) > 1

@@ -39,6 +39,7 @@ def test_normal_evidence_and_posterior():
     assert temperatures[-1] == 1
 
 
+@pytest.mark.study
 def test_evidence_of_angles_across_the_cut():
     data = at_the_cut_data()
     posterior = SMC(**SHORT)(KEY, at_the_cut, data)

@@ -143,6 +143,7 @@ def test_an_episode_of_another_network_is_refused(posterior):
         what_if(jax.random.key(0), kernel(((0, 1),)), posterior, idle(5, 1), draws=3)
 
 
+@pytest.mark.study
 def test_a_policy_meets_the_slots_of_the_log(posterior):
     """A log that begins in slot 3 of its episode is in another slot of a frame than one that begins in slot 0."""
 

@@ -48,6 +48,7 @@ def test_what_an_entry_of_the_data_moves_at_its_own_place_or_before(data):
     assert conditioned(problem, problem.null()) == {"chance", "after", "mean_power", "since"}
 
 
+@pytest.mark.study
 def test_a_second_output_that_follows_from_the_first_is_no_gap(data):
     rewrite = {"power": lambda value, p, context: value + p["size"] * context["distance"]}
     effect = Effect("slope", rewrite, (Parameter("size", dist.Normal(0.0, 1.0)),), requires=("distance",))

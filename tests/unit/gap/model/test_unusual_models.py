@@ -173,6 +173,7 @@ def test_a_transformed_unknown_of_unknown_spread():
     assert log_posterior(problem, x) == pytest.approx(float(own))
 
 
+@pytest.mark.study
 def test_a_count_of_no_trials_says_nothing():
     total = np.where(np.arange(ROWS) % 6 == 0, 0, 12)
 

@@ -83,6 +83,7 @@ def same_everywhere(place, deviation, y=None):
         numpyro.sample("y", dist.Normal(mean, deviation), obs=y)
 
 
+@pytest.mark.study
 def test_sizes_stay_within_what_their_priors_allow():
     """A share that data push to its whole, and a loss that they push against its null, as a sampler finds them."""
     rng = np.random.default_rng(1)
