@@ -71,7 +71,9 @@ def catalogue(sites: Sites, data: Data, use: str | Iterable[str | Effect] = "all
     for entry in [use] if isinstance(use, str) else use:
         if isinstance(entry, Effect):
             check_sites(entry, sites)
-        chosen += [entry] if isinstance(entry, Effect) else _named(entry, sites, data)
+            chosen.append(entry)
+        else:
+            chosen += _named(entry, sites, data)
     return _unique(chosen)
 
 

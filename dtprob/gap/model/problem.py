@@ -81,21 +81,21 @@ class Problem:
         self._cluster = None if self.column else cluster
         self._declare(model, static)
         check_supported(model, data)
-        model = unrolled(real_sites(model, data), data)
-        if model is not self.model:
-            self._declare(model, static)
         self._check_effects()
+        model = unrolled(real_sites(model, data), data)
         changed = {s for effect in effects for s in effect.rewrites} & self.declaration.latent.keys()
         if changed:
-            self._declare(within(self.model, lambda: drawn_apart(changed)), static)
+            model = within(model, lambda: drawn_apart(changed))
+        if model is not self.model:
+            self._declare(model, static)
         self.known: Known = {}
         self.per_cluster: frozenset[str] = frozenset()
         self.volume: Volume | None = None
         self._find_own()
         shared = self.declaration.latent.keys() - self.own.keys()
-        drawn = self.model if reference is not None else decentred(self.model, data, shared, self.own)
+        drawn = model if reference is not None else decentred(model, data, shared, self.own)
         latent = set(self.declaration.latent)
-        if drawn is not self.model:
+        if drawn is not model:
             self._declare(drawn, static)
             self._find_own()
         self.decentred: frozenset[str] = frozenset(self.declaration.latent.keys() - latent - self.own.keys())

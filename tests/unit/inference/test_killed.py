@@ -42,7 +42,8 @@ RUNS = {
     "von_mises_em": VonMisesEM(draws=20),
     "ensemble": Ensemble(members=4, base="laplace", settings={"draws": 5, "starts": 1}),
 }
-ALIKE = {"blackjax_nuts", "hmc", "smc", "ensemble", "von_mises_em"}  # run by the same loops as nuts and svi
+ALIKE = {"blackjax_nuts", "hmc", "smc", "ensemble", "von_mises_em"}
+"""Run by the same loops as nuts and svi; `test_iterate` breaks off smc and the ensemble in this process."""
 
 
 def run(name, **options):
