@@ -28,11 +28,20 @@ def foremost(named: FamilyTest, tests: Sequence[FamilyTest], site: Site) -> str 
         tests: of all families of the site.
         site: that they perturb.
     """
-    single = (t for t in tests if t.family.kind == named.family.kind and t.family.pattern.curves is None)
-    wrong = (test for test in single if test.p_value <= _CHANCE)
-    whole = float((named.told - named.seen).sum())
-    found = (_entry(test, site, whole) for test in (named, *sorted(wrong, key=lambda t: -len(t.variance))))
+    kind, whole = named.family.kind, _excess(named)
+    single = (
+        t for t in tests if t.family.kind == kind and t.family.pattern.curves is None and t.p_value <= _CHANCE
+    )
+    found = (_entry(test, site, whole) for test in (named, *sorted(single, key=lambda t: -len(t.variance))))
     return next((place for place in found if place is not None), None)
+
+
+def _excess(test: FamilyTest) -> float:
+    """What a family tells more than chance does; of curves that overlap the best one, since the same is in many."""
+    curves, excess = test.family.pattern.curves, test.told - test.seen
+    if curves is None or not curves.overlaps:
+        return float(excess.sum())
+    return float(excess.reshape(curves.extent[0], -1).sum(axis=1).max())
 
 
 def _entry(test: FamilyTest, site: Site, whole: float) -> str | None:

@@ -96,3 +96,6 @@ def test_a_far_reading_is_no_place_where_single_ones_are_not_wrong_or_something_
     assert foremost(tested(even, blocks, 1e-9), [tested(alone, None, 1e-9)], site) == "link 17"
     assert foremost(tested(even, blocks, 1e-9), [tested(alone, None, 0.2)], site) is None
     assert foremost(tested(far, blocks, 1e-9), [tested(alone, None, 1e-9)], site) is None
+    beyond = Curves("beyond", np.tri(40), overlaps=True, places=tuple(map(str, range(40))))
+    assert foremost(tested(np.full(40, 7.0), beyond, 1e-9), [tested(alone, None, 1e-9)], site) == "link 17"
+    assert foremost(tested(np.full(40, 14.0), beyond, 1e-9), [tested(alone, None, 1e-9)], site) is None
