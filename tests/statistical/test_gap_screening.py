@@ -220,6 +220,7 @@ def test_scores_beside_a_random_field_are_standard_normal(beside_a_field):
     assert np.all(z.var(axis=0, ddof=1) < 1.15 * high)
 
 
+@pytest.mark.study
 def test_sites_beside_a_random_field_raise_no_alarm(beside_a_field):
     _, p = beside_a_field
     assert np.sum(p <= 0.05) <= stats.binom.ppf(0.999, len(p), 0.07)

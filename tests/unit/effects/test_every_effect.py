@@ -216,6 +216,7 @@ def test_all_together_compile_and_compose(world, effects, base):
         assert not np.allclose(one, np.broadcast_to(before, one.shape), rtol=1e-5, atol=0)
 
 
+@pytest.mark.study
 def test_single_precision_stays_single(world, effects):
     def single(x):
         kind = {np.dtype("float64"): np.float32, np.dtype("complex128"): np.complex64}

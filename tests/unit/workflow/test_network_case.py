@@ -73,6 +73,7 @@ def test_a_disconnected_device_is_named(folder):
     assert found["causes"][0]["size"]["loss"]["low"] > 1.0
 
 
+@pytest.mark.study
 def test_of_reference_data_the_unknowns_are_kept_and_nothing_for_each_slot(folder, tmp_path):
     prepared = prepare(case(folder), need="diagnosis")
     run = Run(tmp_path, resume=False, allow_code=False, say=lambda _: None)

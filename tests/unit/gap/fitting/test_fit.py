@@ -191,7 +191,12 @@ def test_clusters_without_weight_leave_the_fit():
 
 @pytest.mark.parametrize(
     ("name", "model"),
-    [("logistic", logistic), ("counts", counts), ("labels", labels), ("spread", spread)],
+    [
+        ("logistic", logistic),
+        pytest.param("counts", counts, marks=pytest.mark.study),
+        pytest.param("labels", labels, marks=pytest.mark.study),
+        ("spread", spread),
+    ],
 )
 def test_modes_of_other_families_are_stationary(name, model):
     problem = Problem(model, draw(name), [bend()])
