@@ -16,10 +16,9 @@ from dtprob.gap.model.misses import Miss, misses
 from dtprob.gap.model.quick import Adaptive, quick_jit
 from dtprob.gap.model.rows import stacked
 from dtprob.gap.model.running import Arrays, Outcome, Runner
+from dtprob.gap.model.tangents import CHUNK, Tangents, chunks
 from dtprob.gap.observation import whiten
 
-CHUNK: Final = 16
-"""Directions or perturbations that go through a compiled program at a time."""
 _POINTS: Final = 64
 """Points that are evaluated in one run, at most."""
 
@@ -131,7 +130,7 @@ class Compiled:
 
         def chunked(x: np.ndarray, weights: np.ndarray, basis: np.ndarray) -> np.ndarray:
             given = jnp.asarray(x), jnp.asarray(weights, float)
-            parts = [curvature(*given, *chunk, self.arrays) for chunk in _chunks(basis)]
+            parts = [curvature(*given, *chunk, self.arrays) for chunk in chunks(basis)]
             return np.concatenate([np.asarray(part) for part in parts])[: len(basis)]
 
         return chunked
@@ -139,36 +138,8 @@ class Compiled:
     @cached_property
     def linearised(self) -> Callable[[np.ndarray, np.ndarray], tuple[jax.Array, jax.Array]]:
         """(x, basis (k, dimension)) -> whitened residuals (cluster, row) and tangents (cluster, row, k)."""
-
-        @jax.jit
-        def linearised(x: Any, basis: jax.Array, count: Any, arrays: Any) -> tuple[jax.Array, jax.Array]:
-            def parameters(x: Any) -> tuple[dict[str, whiten.Parameters], dict[str, jax.Array]]:
-                found = self._runner.run(x, arrays, {})
-                return found.parameters, found.values
-
-            here, push, values = jax.linearize(parameters, x, has_aux=True)
-            observations = self._runner.around(here)
-            residual = {n: whiten.residual(o, values[n]) for n, o in observations.items()}
-
-            def shifted(direction: jax.Array) -> jax.Array:
-                tangent = push(direction)
-                return self._runner.rows.stack(
-                    {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
-                )
-
-            def put(i: Any, into: jax.Array) -> jax.Array:  # at once they would not fit in a CPU's cache
-                return into.at[i].set(shifted(basis[i]))
-
-            one = jax.eval_shape(shifted, basis[0])
-            columns = jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, *one.shape), one.dtype))
-            return self._runner.rows.stack(residual), jnp.moveaxis(columns, 0, -1)
-
-        def chunked(x: np.ndarray, basis: np.ndarray) -> tuple[jax.Array, jax.Array]:
-            parts = [linearised(jnp.asarray(x), *chunk, self.arrays) for chunk in _chunks(basis)]
-            columns = parts[0][1] if len(parts) == 1 else jnp.concatenate([c for _, c in parts], axis=-1)
-            return parts[0][0], columns[..., : len(basis)]
-
-        return chunked
+        tangents = Tangents(self._runner)
+        return lambda x, basis: tangents(x, basis, self.arrays)
 
     def replicate(self, x: np.ndarray, keys: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         """Whitened residuals (n, cluster, row) and observed values (n, ...) by site, drawn at x with keys (n,)."""
@@ -306,7 +277,7 @@ class Compiled:
             x: np.ndarray, basis: np.ndarray, weights: np.ndarray | None = None
         ) -> tuple[np.ndarray, np.ndarray]:
             given = jnp.ones(self._runner.rows.n_cluster) if weights is None else jnp.asarray(weights, float)
-            parts = [prior(jnp.asarray(x), chunk, given, self.arrays) for chunk, _ in _chunks(basis)]
+            parts = [prior(jnp.asarray(x), chunk, given, self.arrays) for chunk, _ in chunks(basis)]
             return np.asarray(parts[0][0]), np.concatenate([c for _, c in parts])[: len(basis)]
 
         return chunked
@@ -354,11 +325,3 @@ def _filled(given: Any, like: jax.Array) -> jax.Array:
     part = np.zeros(like.shape, like.dtype)
     part[: len(given)] = given
     return jnp.asarray(part)
-
-
-def _chunks(basis: np.ndarray) -> Iterator[tuple[jax.Array, int]]:
-    """Rows of a basis in chunks of one size, at least one, the last filled up with zeros, and how many of each count."""
-    count = max(-(-len(basis) // CHUNK), 1)
-    padded = np.concatenate([basis, np.zeros((count * CHUNK - len(basis), basis.shape[1]))])
-    for start in range(0, len(padded), CHUNK):
-        yield jnp.asarray(padded[start : start + CHUNK]), min(len(basis) - start, CHUNK)

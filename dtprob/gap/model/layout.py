@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import combinations
-from typing import Any, Final
+from typing import Any, Final, cast
 
 import jax
 import jax.numpy as jnp
@@ -61,12 +61,18 @@ class Layout:
         return next(b for b in self.blocks if b.name == name)
 
     def part(self, x: Any, name: str) -> jax.Array:
-        """The value of one block."""
+        """The value of one block of a flat vector, or of blocks by their names."""
+        if isinstance(x, Mapping):
+            return cast("Mapping[str, jax.Array]", x)[name]
         block = self[name]
         size = int(np.prod(block.shape, dtype=int))
         if size == 0:
             return jnp.zeros(block.shape)
         return jax.lax.dynamic_slice_in_dim(x, block.offset, size).reshape(block.shape)
+
+    def split(self, x: Any) -> dict[str, jax.Array]:
+        """The values of all blocks, by name."""
+        return {block.name: self.part(x, block.name) for block in self.blocks}
 
     def indices(self, names: Iterable[str]) -> np.ndarray:
         """Positions of some blocks that are not local to clusters, one after another."""

@@ -82,7 +82,10 @@ class Runner:
 
     @cached_property
     def run(self) -> Callable[[Any, Any, Mapping[str, Any]], Outcome]:
-        """(x, arrays, perturbations of sites) -> what the model says there; all that calls it shares one trace."""
+        """(x, arrays, perturbations of sites) -> what the model says there; all that calls it shares one trace.
+
+        Where x is split into its blocks, derivatives by some of them do not pass through what depends on the others.
+        """
         return jax.jit(self._run)
 
     def _run(self, x: Any, arrays: Arrays, deltas: Mapping[str, Any]) -> Outcome:

@@ -18,11 +18,11 @@ import numpy as np
 
 from dtprob.effects.effect import Context, Effect
 from dtprob.gap.fitting.centred import Centred
-from dtprob.gap.model.compiled import CHUNK
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.model.rewrites import null_vector, unflatten
+from dtprob.gap.model.tangents import CHUNK
 from dtprob.gap.observation import whiten
 
 

@@ -19,8 +19,8 @@ from jaxtyping import Bool
 from dtprob.effects.effect import Effect
 from dtprob.gap.fitting.plausible import WHOLE, nulls, scales, sides, sizes
 from dtprob.gap.fitting.sweep import combined, elsewhere
-from dtprob.gap.model.compiled import CHUNK
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.model.tangents import CHUNK
 from dtprob.gap.which.directions import Surroundings, surroundings
 
 _REACH = 2.5
