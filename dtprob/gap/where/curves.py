@@ -40,6 +40,8 @@ _LONGEST: Final = 24
 """Period of the longest cycle that is looked for; longer ones show as ripples."""
 _TURNS: Final = 24
 """Times that a cycle has to come round: sums of a few entries are far from normal."""
+OWN_TURNS: Final = 6
+"""The same of a cycle of each cluster's own, of which it is what many of them tell together."""
 
 
 class Ripple(NamedTuple):
@@ -205,12 +207,12 @@ def groups_in_words(index: np.ndarray, columns: Mapping[str, np.ndarray]) -> tup
     return tuple(" and ".join(f"{n} {float(column[i]):.6g}" for n, column in columns.items()) for i in first)
 
 
-def cycles(size: int, over: str) -> tuple[Curves, ...]:
+def cycles(size: int, over: str, *, turns: int = _TURNS) -> tuple[Curves, ...]:
     """For each period, the phases at which something may repeat along axes of some positions; none where they are short."""
     place = np.arange(size)
     return tuple(
         Curves(f"every {period} along {over}", sparse.csr_matrix((np.ones(size), (place % period, place))))
-        for period in range(2, min(_LONGEST, size // _TURNS) + 1)
+        for period in range(2, min(_LONGEST, size // turns) + 1)
     )
 
 

@@ -17,7 +17,7 @@ from scipy import sparse
 
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import likelihood
-from dtprob.gap.where.curves import Curves, cycles, stretches
+from dtprob.gap.where.curves import OWN_TURNS, Curves, cycles, stretches
 from dtprob.gap.where.quantities import Quantity
 from dtprob.models.axes import is_unnamed
 
@@ -27,8 +27,8 @@ _ROWS: Final = 8
 """Positions of a second axis from which rows may follow one another from cluster to cluster."""
 _COLUMNS: Final = 16
 """Entries of a last axis up to which each is looked at."""
-_MOST_OF_STRETCHES: Final = 1 << 16
-"""Entries of a site of which stretches are looked at."""
+_MOST_OF_EACH: Final = 1 << 16
+"""Entries of a site of which stretches, and what repeats in each cluster, are looked at."""
 _MOST_BLOCKS: Final = 1 << 13
 """Stretches of one axis by those of another that are looked at."""
 
@@ -243,21 +243,24 @@ def _size(site: Site, axes: Sequence[int]) -> int:
 def _stretches(site: Site) -> Iterator[Pattern]:
     """Stretches of the last axis of what lies along one or two, those of each position and each stretch of the first."""
     shape = site.value.shape
-    if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_STRETCHES:
+    if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_EACH:
         return
     for found in stretches(shape[-1], site.axes[-1]):
         if len(shape) == 1:
             yield Pattern(found.label, (0,), found)
             continue
-        each = Curves(
-            f"{found.label} x {site.axes[0]}",
-            sparse.csr_matrix(sparse.kron(sparse.identity(shape[0]), found.values)),
-        )
+        each = _of_each(found, site)
         yield Pattern(each.label, (0, 1), each)
         for first in stretches(shape[0], site.axes[0]):
             if first.extent[0] * found.extent[0] <= _MOST_BLOCKS:
                 blocks = _crossed(f"block of {site.axes[0]} and {site.axes[1]}", first, found)
                 yield Pattern(blocks.label, (0, 1), blocks)
+
+
+def _of_each(curves: Curves, site: Site) -> Curves:
+    """Curves along the last of a site's two axes, each position of the first with weights of its own."""
+    each = sparse.kron(sparse.identity(site.value.shape[0]), curves.values)
+    return Curves(f"{curves.label} x {site.axes[0]}", sparse.csr_matrix(each))
 
 
 def _crossed(label: str, first: Curves, second: Curves) -> Curves:
@@ -277,6 +280,10 @@ def _cycles(site: Site) -> Iterator[Pattern]:
     if len(shape) > 1 and shape[1] >= _ROWS and np.prod(shape[2:]) <= _COLUMNS:
         for found in cycles(shape[0] * shape[1], f"{site.axes[0]} and {site.axes[1]}"):
             yield Pattern(found.label, kept, found)
+    if len(shape) == 2 and np.prod(shape) <= _MOST_OF_EACH:
+        for found in cycles(shape[1], site.axes[1], turns=OWN_TURNS):
+            each = _of_each(found, site)
+            yield Pattern(each.label, kept, each)
 
 
 def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:

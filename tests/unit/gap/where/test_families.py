@@ -277,6 +277,22 @@ def test_a_cycle_goes_on_from_cluster_to_cluster(problem):
     np.testing.assert_allclose(step, value, atol=1e-12)
 
 
+def test_a_cycle_of_a_few_clusters_own_is_noticed_where_none_of_them_shows_it():
+    """Six cells of thirty in four hours of each of seven days, 1.2 standard deviations."""
+    rng = np.random.default_rng(9)
+    gradients = rng.normal(size=(200, 30, 168))
+    gradients[0, ::5] += 1.2 * (np.arange(168) % 24 >= 20)
+    site = deterministic("load", ("cell", "hour"), np.ones((30, 168)), gradients)
+    found = {f.label: family_test(f, s) for f, s in families(lambda *_: (), (), site)}
+    own = found["additive, every 24 along hour x cell"]
+    assert own.variance.shape == (720,)
+    assert own.p_value < 1e-8
+    assert found["additive, stretch of hour x cell"].p_value > 100 * own.p_value
+    step = own.family.step(own.first[0], own.variance, site.value)
+    np.testing.assert_allclose(step[:, :24], step[:, 144:], atol=1e-12)
+    assert np.corrcoef(step[::5, :24].mean(0), np.arange(24) >= 20)[0, 1] > 0.8
+
+
 def test_what_whole_numbers_tell_apart_is_told_of_each_outcome(problem):
     """What a device did last tilts the odds between its outcomes, which sum to nothing over them."""
     rng = np.random.default_rng(5)
