@@ -135,9 +135,12 @@ EFFECTS: Final = (
 """Candidates of every twin. Another material of all walls joins them, and refraction_off where the twin lets nothing
 through walls."""
 
+TAIL_SPREAD: Final = 3.0
+"""dB by which the tail of one link differs from another's."""
+
 LACKING: Final = (
     *("polarization_mismatch", "missing_path[line_of_sight]", "missing_path[reflection]", "wall_law"),
-    "depth_cut_off",
+    *("depth_cut_off", "missing_object"),
 )
 """What the honest twin may be found to lack: things that have the same name in every twin. The campaign's own notes, of
 places to a centimetre and whose they are, the carrier and the bandwidth, are believed there."""
@@ -217,6 +220,7 @@ def _case(twin: Twin, known: Sequence[str], offered: Sequence[str] | None) -> st
     scene["check_transmitters"] = any(name in _SWAPS for name in offered)
     sections: dict[str, Mapping[str, Any]] = {
         "model": {"name": "ultra_wideband_profile"},
+        "model.options": {"tail_spread_db": TAIL_SPREAD},
         "data": {"file": NAME},
         "data.options": {"averages": 2, "level": "reported", "links": list(LINKS)},
         "scene": scene,

@@ -61,14 +61,16 @@ def ultra_wideband_profile(
     tap_noise: Float[Array, " link"] | None = None,
     materials: Materials = "known",
     law: Law = "slab",
+    tail_spread_db: float = 0.0,
     power: Float[Array, "link tap"] | None = None,
 ) -> jax.Array:
     """Mean power of each delay tap of a ray-traced scene, its time origin from two-way ranging.
 
     Unknown: the response of pulse and filters, the radiated power, the saturated level and for each link a gain (as for
     `ultra_wideband_channel`), and its error of ranging (0.6 ns, heavy tails, about a common offset); the power of the tail
-    (against free space over the first path) and its decay; a floor under all taps, of the link's mean, as side lobes of the
-    receiver's correlation make; the shape of the taps' distribution; materials where asked for.
+    (against free space over the first path), of each link where it has a spread, and its decay; a floor under all taps, of
+    the link's mean, as side lobes of the receiver's correlation make; the shape of the taps' distribution; materials where
+    asked for.
 
     Args:
         paths: propagation paths of each link.
@@ -77,6 +79,7 @@ def ultra_wideband_profile(
         tap_noise: W, mean power of the noise in each tap of a link; 0 where absent.
         materials: which permittivities and conductivities are unknown, as for `ray_traced_channel`.
         law: "slab" (finite thickness) or "half_space".
+        tail_spread_db: standard deviation, dB, of a link's tail about what all have in common; 0 where all are alike.
         power: the measurement, W, from `delay_profile`.
 
     Returns:
@@ -101,7 +104,8 @@ def ultra_wideband_profile(
     late = site("receiver_delay", receiver.delay)
     pulse = unknown_pulse(subcarrier_frequency)
     traced = _over_taps(each, delay + late[:, None], pulse, subcarrier_frequency, tap_delay)
-    room = traced + site("tail", _unknown_tail(paths, delay, late, tap_delay))
+    own = _unknown_strength(shape[0], tail_spread_db)[:, None]
+    room = traced + site("tail", own * _unknown_tail(paths, delay, late, tap_delay))
     floor: Any = numpyro.sample("floor", dist.LogNormal(np.log(1e-3), 1.5))
     room = room + floor * jnp.mean(room, axis=1, keepdims=True)
     amplitude = site("receiver_gain", gain_law(jnp.sum(room, axis=1), receiver))
@@ -154,6 +158,15 @@ def _unknown_receiver(links: int) -> Receiver:
         delay: Any = numpyro.sample("link_delay", dist.StudentT(RANGING_TAIL, 0.0, 1.0))
         log_gain: Any = numpyro.sample("link_gain", dist.Normal(0.0, 1.0))
     return Receiver(offset + RANGING_SPREAD * delay, GAIN_SPREAD * log_gain, *levels)
+
+
+def _unknown_strength(links: int, spread_db: float) -> Float[Array, " link"]:
+    """By which factor the power of each link's tail departs from what all have in common."""
+    if spread_db == 0.0:
+        return jnp.ones(links)
+    with numpyro.plate("link", links, dim=-1):
+        strength: Any = numpyro.sample("tail_strength", dist.Normal(0.0, 1.0))
+    return jnp.exp(spread_db * np.log(10.0) / 10.0 * strength)
 
 
 def _over_taps(

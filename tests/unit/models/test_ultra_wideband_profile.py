@@ -93,6 +93,21 @@ def test_the_tail_is_exponential_behind_the_first_path(paths):
         np.testing.assert_allclose(tail[late], expected, rtol=1e-3)
 
 
+def test_the_tail_of_a_link_is_its_own_by_so_many_decibels(paths):
+    common = {"tail_share": jnp.asarray(0.2), "tail_decay": jnp.asarray(8e-9)}
+    strength = np.array([0.0, 1, -1, 2, 0.5])
+    own = {"tail_strength": jnp.asarray(strength)}
+    found = traced(paths, {"tail_spread_db": 3.0}, **common, **own)
+    plain = traced(paths, **common)
+    expected = np.asarray(plain["tail"]["value"]) * 10 ** (0.3 * strength)[:, None]
+    np.testing.assert_allclose(found["tail"]["value"], expected, rtol=1e-6)
+    assert "tail_strength" not in plain
+    unknown = declare(ultra_wideband_profile, arguments(paths) | {"tail_spread_db": 3.0}).sites[
+        "tail_strength"
+    ]
+    assert (unknown.shape, unknown.distribution) == ((5,), "Normal")
+
+
 def test_the_floor_is_the_same_under_all_taps(paths):
     plain, sites = at(paths)["tap_power"], at(paths, floor=jnp.asarray(0.3))["tap_power"]
     np.testing.assert_allclose(
