@@ -11,7 +11,7 @@ from scipy import optimize, stats
 from dtprob.effects import Effect, Parameter
 from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
-from dtprob.gap.fitting import marginal_mode
+from dtprob.gap.fitting import integrated, marginal_mode
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.fitting.integrated import based
 from dtprob.gap.model.problem import Problem
@@ -105,6 +105,31 @@ def test_the_mode_is_that_of_the_exact_marginal_density():
     assert height(joint_mode) < -best.fun - 2.0  # what the expansion is for
     laplace = -best.fun + 1.5 * np.log(2 * np.pi) + 0.5 * np.linalg.slogdet(best.hess_inv)[1]
     assert found.fitted.log_evidence == pytest.approx(laplace, abs=0.5)
+
+
+def test_states_of_every_reading_are_integrated_out_at_once(monkeypatch):
+    """No joint mode is sought, which would run away step by step; the marginal one is that of the exact density."""
+    data = of_fading(3, runs=8, slots=40)
+    problem = Problem(fading, data, [DROP])
+    monkeypatch.setattr(integrated, "_runs_away", lambda *_: pytest.fail("a joint mode was sought"))
+    found = based(problem, KEY)
+    power, lag = np.asarray(data["power"]), np.arange(40)
+
+    def height(x):
+        mean, memory, step, noise = x[0], 1 / (1 + np.exp(-x[1])), np.exp(x[2]), np.exp(x[3])
+        response = np.where(lag[:, None] >= lag, memory ** np.maximum(lag[:, None] - lag, 0.0), 0.0)
+        covariance = step**2 * response @ response.T + noise**2 * np.eye(40)
+        prior = stats.norm.logpdf(mean, -70, 10) + stats.norm.logpdf(x[2:], 0, 0.5).sum()
+        prior += stats.beta.logpdf(memory, 8, 2) + np.log(memory * (1 - memory))
+        return stats.multivariate_normal(np.full(40, mean), covariance).logpdf(power).sum() + prior
+
+    best = optimize.minimize(lambda x: -height(x), np.array([-68.0, 1.4, 0.0, 0.0]))
+    values = found.problem.initial(found.fitted.x, [])
+    mean, memory, step, noise = (float(values[n]) for n in ("mean", "memory", "step", "noise"))
+    assert (
+        height(np.array([mean, np.log(memory / (1 - memory)), np.log(step), np.log(noise)]))
+        > -best.fun - 0.05
+    )
 
 
 def test_levels_of_known_spread_are_left_to_the_joint_mode():
