@@ -53,7 +53,8 @@ def looked(log):
     return at
 
 
-@pytest.mark.parametrize("window", [30, pytest.param(54, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("window", [30, 54])
 def test_when_a_device_died_is_found(looked, window):
     p, onset = looked(window)
     assert p < 1e-4
