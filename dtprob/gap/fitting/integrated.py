@@ -25,7 +25,7 @@ from dtprob.gap.fitting.marginal_mode import (
     height_at,
     steps,
 )
-from dtprob.gap.fitting.states import LARGE, MANY, held, states
+from dtprob.gap.fitting.states import each_has_states, held, states
 from dtprob.gap.fitting.sweep import turned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.trials import Say, Start
@@ -50,13 +50,12 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     Raises:
         InputError: the model has no finite likelihood from any start; what breaks is named.
     """
-    shared, own = held(problem), activate(problem).local_index
-    has_states = bool(states(problem).blocks)
-    if not (has_states or own.shape[1]) or not len(shared):
+    shared, has_states = held(problem), bool(states(problem).blocks)
+    if not (has_states or activate(problem).local_index.shape[1]) or not len(shared):
         return Start(problem, fit_base(problem, key, polished=polished))
     centre, free = turned(problem, problem.prior_middle[0], problem.compiled.by_cluster), around(problem)
     starts = [centre]
-    at_once = has_states or (own.shape[1] >= LARGE and own.size >= MANY * problem.observed.count)
+    at_once = has_states or each_has_states(problem)
     if not at_once and not _runs_away(problem, fit(problem, centre), centre, free):
         joint = fit_base(problem, key, polished=polished)
         if not _runs_away(problem, joint, centre, free):

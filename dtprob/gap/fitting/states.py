@@ -18,9 +18,9 @@ from dtprob.gap.fitting.density import moved, system_at, value_of
 from dtprob.gap.fitting.newton import newton_step
 from dtprob.gap.model.problem import Problem
 
-MANY: Final = 0.25
+_MANY: Final = 0.25
 """Unknowns for each observed value from which the largest of them are states."""
-LARGE: Final = 32
+_LARGE: Final = 32
 """Entries of an unknown, shared or of each cluster, from which they may be states."""
 _NORMAL: Final = ("Normal", "MultivariateNormal", "GaussianRandomWalk")
 """Distributions of states."""
@@ -33,13 +33,19 @@ def states(problem: Problem) -> Active:
     """
     active, sites = activate(problem), problem.declaration.sites
     shared = [b for b in active.blocks if not b.local]
-    many = sum(b.size for b in shared) >= MANY * problem.observed.count
+    many = sum(b.size for b in shared) >= _MANY * problem.observed.count
     chosen = (
-        b.name in problem.in_units or (many and b.size >= LARGE and sites[b.name].distribution in _NORMAL)
+        b.name in problem.in_units or (many and b.size >= _LARGE and sites[b.name].distribution in _NORMAL)
         for b in shared
     )
     found = tuple(b for b, is_state in zip(shared, chosen, strict=True) if is_state)
     return replace(active, blocks=(*found, *(b for b in active.blocks if b.local)) if found else ())
+
+
+def each_has_states(problem: Problem) -> bool:
+    """Whether about every reading of a cluster has an unknown of the cluster's own."""
+    own = activate(problem).local_index
+    return own.shape[1] >= _LARGE and own.size >= _MANY * problem.observed.count
 
 
 def are_states(problem: Problem, active: Active) -> Bool[np.ndarray, " shared"]:
