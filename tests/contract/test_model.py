@@ -22,7 +22,9 @@ def few_links(prepared):
     return data
 
 
-@pytest.mark.parametrize("model", [ray_traced_channel, phase_error_channel])
+@pytest.mark.parametrize(
+    "model", [pytest.param(ray_traced_channel, marks=pytest.mark.study), phase_error_channel]
+)
 def test_channel_models(model, few_links):
     data = {
         name: value for name, value in few_links.items() if model is ray_traced_channel or name != "phase"

@@ -386,15 +386,12 @@ def town(east, north, power=None):
         numpyro.sample("power", dist.Normal(expected, error), obs=power)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("wrong", "labels"),
     [
         (lambda distance, _power: 2.0 * np.sin(2 * np.pi * distance / 40), ("ripple in distance, 17 to 32",)),
-        pytest.param(
-            lambda _distance, power: np.minimum(-95.0 - power, 0.0),
-            ("along ", "beyond "),
-            marks=pytest.mark.study,
-        ),
+        (lambda _distance, power: np.minimum(-95.0 - power, 0.0), ("along ", "beyond ")),
     ],
     ids=["a wave from the ground", "a receiver that saturates"],
 )

@@ -1,4 +1,4 @@
-"""Two withheld cases of networks and one of a ray-traced channel; see `tests.withheld_study` for what the bounds mean."""
+"""Two withheld cases of networks and, a study, one of a ray-traced channel; see `tests.withheld_study` for the bounds."""
 
 import pytest
 
@@ -14,6 +14,7 @@ def test_networks(tmp_path):
     assert missed <= at_most(of, 0.01)
 
 
+@pytest.mark.study
 @pytest.mark.libllvm
 def test_channels(tmp_path):
     found = studied(tmp_path, "channel", ["null"], seed=20)

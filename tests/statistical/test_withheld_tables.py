@@ -1,11 +1,11 @@
-"""57 withheld cases of labels and of users' own models; see `tests.withheld_study` for what the bounds mean."""
+"""58 withheld cases of labels and of users' own models; see `tests.withheld_study` for what the bounds mean."""
 
 import pytest
 
 from tests.withheld_study import at_least, at_most, studied, summed
 
 CASES = {
-    "labels": [*["null"] * 24, *["listed"] * 7, *["unlisted"] * 4],
+    "labels": [*["null"] * 25, *["listed"] * 7, *["unlisted"] * 4],
     "custom": [*["null"] * 14, *["listed"] * 5, *["unlisted"] * 3],
 }
 
@@ -18,7 +18,7 @@ def found(tmp_path_factory):
 
 def test_false_alarms(found):
     count, of = summed(found, "null", "alarm")
-    assert of == 38
+    assert of == 39
     assert count <= at_most(of, 0.01)
 
 

@@ -382,6 +382,7 @@ def test_noise_by_hand(world, apply):
     assert np.allclose(uneven[:, :, :, 0, 0], np.exp(each))  # the first chain, too
 
 
+@pytest.mark.study
 def test_interference_reaches_the_lowest_subcarrier_however_its_place_is_rounded(world):
     rng = np.random.default_rng(0)
     for _ in range(50):

@@ -43,6 +43,7 @@ CASES = {
 }
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("name", CASES)
 def test_choice(name):
     model, data, engine, reason = CASES[name]

@@ -96,6 +96,7 @@ def test_contract_on_channels(paths, statistics, phase):
     )
 
 
+@pytest.mark.study
 def test_contract_on_powers(paths, statistics):
     check_model(uniform_phase_channel, {"paths": paths, **compress_powers(statistics)})
 

@@ -216,6 +216,7 @@ def arguments(paths):
     return {"paths": paths, **grid, "power": jnp.full((5, 49), 1e-12), "tap_noise": jnp.full(5, 1e-15)}
 
 
+@pytest.mark.study
 def test_the_contract_and_the_effects_that_powers_tell(paths):
     data = arguments(paths)
     check_model(ultra_wideband_profile, data)

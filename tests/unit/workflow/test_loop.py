@@ -142,6 +142,7 @@ def _runs(case, tmp_path_factory):
     return whole, part, first
 
 
+@pytest.mark.study
 def test_a_resumed_loop_is_the_same_to_the_last_bit(case, runs):
     whole, part, _ = runs
     assert json.dumps(history(case, whole)) == json.dumps(history(case, part))

@@ -31,6 +31,7 @@ def test_the_table_is_what_its_script_writes(folder, monkeypatch):
     assert (folder / "table.csv").read_bytes() == before
 
 
+@pytest.mark.study
 def test_the_site_that_sends_less_is_named(folder):
     prepared = prepare(load_case(folder / "case.toml"), need="diagnosis")
     assert prepared.cluster == "segment"

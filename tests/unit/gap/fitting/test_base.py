@@ -154,6 +154,7 @@ def tailed(x, offset, y=None):
         numpyro.sample("y", dist.StudentT(power + offset, mean, spread), obs=y)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", range(3))
 def test_a_step_does_not_lead_where_a_logarithm_is_endless(seed):
     """At nu = exp(-77) nothing leads back: fits ended 25 to 141 nats below the mode."""

@@ -112,6 +112,7 @@ def test_spreads_are_those_of_the_marginal_mode(twin, data):
     np.testing.assert_allclose(told, exact(data, devices=len(names) == 3), rtol=0.05)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("twin", "expected"),
     [(in_units, {"w"}), (of_days_alone, {"w"}), (centred, {"w_decentered"}), (regression, set())],

@@ -189,12 +189,13 @@ def test_clusters_without_weight_leave_the_fit():
     np.testing.assert_allclose(fitted.log_evidence, evidence, rtol=1e-9)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("name", "model"),
     [
         ("logistic", logistic),
-        pytest.param("counts", counts, marks=pytest.mark.study),
-        pytest.param("labels", labels, marks=pytest.mark.study),
+        ("counts", counts),
+        ("labels", labels),
         ("spread", spread),
     ],
 )

@@ -216,6 +216,7 @@ def turned_tones(tone, signal=None):
             numpyro.sample("signal", ComplexNormal(expected, noise), obs=signal)
 
 
+@pytest.mark.study
 def test_a_gap_that_no_prior_of_the_noise_expects_is_no_runaway(monkeypatch):
     """A twin far off puts the noise 60 standard deviations from its prior; expansions on the way there took minutes."""
     rng = np.random.default_rng(0)

@@ -4,6 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+import pytest
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting.active import activate
@@ -43,6 +44,7 @@ def shared(y, weights=None, effects=()):
     return problem, found
 
 
+@pytest.mark.study
 def test_levels_of_clusters_that_are_left_out_do_not_move_what_is_shared():
     _, alone = shared(Y[KEPT])
     problem, found = shared(Y, KEPT.astype(float))

@@ -248,6 +248,7 @@ def information(law, mean):
     return mean * 6.0 / total, mean**2 / total**2 / np.vectorize(of_counts)(mean, 6.0)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("law", ["Gamma", "LogNormal", "NegativeBinomial"])
 def test_what_is_lost_is_the_slope_of_the_curvature_of_own_unknowns(law):
     """Of -1/2 log H, H the information on a level within an exponential and its prior's, by the closed form of each law."""

@@ -73,6 +73,7 @@ def test_only_what_multiplies_own_unknowns_is_mirrored(problem):
     np.testing.assert_array_equal(other[rest], x[rest])
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", range(4))
 def test_the_base_fit_finds_the_right_mode(problem, seed):
     found = base.fit_base(problem, jax.random.key(seed))

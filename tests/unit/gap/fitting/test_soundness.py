@@ -140,6 +140,7 @@ def free_noise(x, y=None):
         numpyro.sample("y", dist.Normal(mean, noise), obs=y)
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(
     ("level", "slope"), [(0.0, 0.0), (1.0, 0.0), (1.0, 2.0)], ids=["off", "stuck", "noiseless"]
 )
@@ -170,6 +171,7 @@ def test_small_spreads_of_large_values_are_kept():
         check_noise(problem, fit_base(problem, jax.random.key(0)))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", range(4))
 def test_a_spread_below_its_priors_scale_in_few_rows_is_no_gap(seed):
     """Of four seeds, two rang at p below 1e-9 when the prior of a spread was taken as normal where it is flat."""

@@ -87,6 +87,7 @@ def fitted():
     return data, start.problem, start.fitted
 
 
+@pytest.mark.study
 def test_the_walk_is_what_is_integrated_out(fitted):
     _, problem, _ = fitted
     assert [b.name for b in states(problem).blocks] == ["shadowing_decentered"]

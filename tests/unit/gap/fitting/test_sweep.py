@@ -149,6 +149,7 @@ def elsewhere_pulses(late, loud):
     return WEAKER * np.exp(loud)[:, None] * np.exp(-0.5 * (apart / 0.2) ** 2).sum(0)
 
 
+@pytest.mark.study
 def test_what_needs_the_links_found_anew_is_seen_by_the_scan():
     late, loud = LATE / 4, np.array([1.6, 1.8, 1.4, 1.7, 1.6])
     noise = NOISE * np.random.default_rng(4).normal(size=(len(late), len(TAPS)))
@@ -198,6 +199,7 @@ def silenced(links, y=None):
             numpyro.sample("y", dist.Normal(power, noise), obs=y)
 
 
+@pytest.mark.study
 def test_what_the_fit_has_silenced_is_seen_about_the_priors_centre():
     late = LATE / 4
     noise = NOISE * np.random.default_rng(5).normal(size=(len(late), len(TAPS)))

@@ -50,6 +50,7 @@ def jitter(unit):
     )
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("true", [1.0, 0.3, 0.0])
 def test_a_spread_of_less_than_a_nanosecond_is_found(true):
     rng = np.random.default_rng(0)

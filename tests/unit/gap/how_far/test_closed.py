@@ -182,7 +182,8 @@ def test_interval_covers_the_share_in_the_population():
     assert stats.binom.ppf(1e-3, trials, 0.86) <= hits <= stats.binom.ppf(0.999, trials, 0.94)
 
 
-@pytest.mark.parametrize("size", [3, pytest.param(1, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("size", [3, 1])
 def test_interval_covers_what_estimation_costs(size):
     """Clusters N(m, 1) of `size` entries, m known to be 0 and in truth 1: what the fit of m does to clusters never seen."""
     n, parts, trials, hits = 200, 4, 200, 0

@@ -120,7 +120,8 @@ def test_standard_units_leave_the_density_as_it_is(data):
     assert decentred(sensors, data, ["slope"]) is sensors
 
 
-@pytest.mark.parametrize("cluster", ["day", pytest.param("site", marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("cluster", ["day", "site"])
 def test_a_cause_beside_levels_is_told(data, cluster):
     bent = {**data, "y": data["y"] + 0.4 * (data["x"] ** 2 - 1)}
     for given, verdict in ((data, "NO_GAP"), (bent, "LISTED")):

@@ -195,6 +195,7 @@ def test_a_count_of_no_trials_says_nothing():
     assert not rows[~tried].any()
 
 
+@pytest.mark.study
 def test_an_effect_on_a_censored_law_is_told_as_much_as_one_on_its_site():
     """Where readings are censored is told by the readings, not by an effect."""
 

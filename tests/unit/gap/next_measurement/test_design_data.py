@@ -215,6 +215,7 @@ def test_a_random_field_is_part_of_what_its_rival_predicts_whichever_comes_first
             assert nats == pytest.approx(divergence(expected[truth], expected[rival]), rel=1e-5)
 
 
+@pytest.mark.study
 def test_a_diagnosis_recommends_what_splits_its_class():
     x = np.linspace(0.3, 2.0, 40)
     wide = np.linspace(-3, 3, 7)

@@ -155,6 +155,7 @@ def test_a_wall_is_named_and_its_loss_is_right(kind):
     assert cause.closed_fraction.mean > 0.9
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("kind", KINDS)
 def test_nothing_is_named_where_nothing_is_wrong(kind):
     assert found(kind, 0.0, seed=5).verdict == "NO_GAP"

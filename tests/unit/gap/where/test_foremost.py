@@ -58,6 +58,7 @@ def test_groups_are_named_by_their_values():
     assert told([1.0, 9.0, -1.0], found=overlapping, shape=(3, 1)) is None  # its label says where
 
 
+@pytest.mark.study
 @pytest.mark.parametrize(("which", "place"), [("group", "access_point 11"), ("reading", "reading 41")])
 def test_a_report_says_which_group_or_reading_it_is(which, place):
     rng = np.random.default_rng(2)

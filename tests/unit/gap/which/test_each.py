@@ -126,6 +126,7 @@ def test_what_moves_receivers_each_by_something_else_is_no_field_with_entries_in
     assert EACH.name in found
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("seed", range(3))
 def test_where_no_receiver_has_moved_far_there_is_nothing_to_start_from(seed):
     """A start of nothing would be a field without a spread."""

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
+import pytest
 
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.diagnose import diagnose
@@ -38,6 +39,7 @@ def found(candidate, curvature, levels):
     )
 
 
+@pytest.mark.study
 def test_an_effect_beside_unknown_levels_is_kept():
     """Levels of access points, which no effect knows, bring four times its gain."""
     said = found(BEND, 1.6, LEVELS)

@@ -26,6 +26,7 @@ def lambdas(quality, practice, *, runs=400, n=60, count=500):
     return jax.tree.map(np.ravel, jax.vmap(one)(jax.random.split(jax.random.key(5), runs)))
 
 
+@pytest.mark.study
 @pytest.mark.parametrize("quality", QUALITIES)
 def test_lambda_stays_within_its_bounds(quality):
     found = lambdas(quality, Practice())
