@@ -14,6 +14,7 @@ from dtprob.gap.fitting.marginal import settled
 from dtprob.gap.fitting.mirrored import mirrored
 from dtprob.gap.fitting.soundness import broken
 from dtprob.gap.fitting.sweep import turned
+from dtprob.gap.fitting.unwound import unwound
 from dtprob.gap.model.problem import Problem
 
 _PRIOR_DRAWS = 64
@@ -53,7 +54,8 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
     for block in (problem.layout[name] for name in added):
         draws[:, block.index] = np.median(draws[:, block.index], axis=0)
     fits = []
-    for x in [np.median(draws, axis=0), *draws[: starts - 1]]:
+    middle = np.median(draws, axis=0)
+    for x in [*unwound(problem, middle), middle, *draws[: starts - 1]]:
         fitted = fitting.fit(problem, turned(problem, x, problem.compiled.by_cluster))
         if np.isfinite(fitted.log_posterior):
             fits.append(fitted)
@@ -62,7 +64,7 @@ def fit_base(problem: Problem, key: jax.Array, starts: int = 8, polished: int = 
         if len(values) > _ENOUGH and max(values) - min(values) < _SAME:
             break
     if not fits:
-        raise broken(problem, [np.median(draws, axis=0), *draws[: starts - 1]])
+        raise broken(problem, [middle, *draws[: starts - 1]])
     found = _apart(fits)
     freed: list[fitting.Fit] = []
     for fitted in found[:polished]:

@@ -27,6 +27,7 @@ from dtprob.gap.fitting.marginal_mode import (
 )
 from dtprob.gap.fitting.states import each_has_states, held, states
 from dtprob.gap.fitting.sweep import turned
+from dtprob.gap.fitting.unwound import unwound
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.which.trials import Say, Start
 
@@ -54,7 +55,7 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     if not (has_states or activate(problem).local_index.shape[1]) or not len(shared):
         return Start(problem, fit_base(problem, key, polished=polished))
     centre, free = turned(problem, problem.prior_middle[0], problem.compiled.by_cluster), around(problem)
-    starts = [centre]
+    starts = [centre, *unwound(problem, centre)]
     at_once = has_states or each_has_states(problem)
     if not at_once and not _runs_away(problem, fit(problem, centre), centre, free):
         joint = fit_base(problem, key, polished=polished)
