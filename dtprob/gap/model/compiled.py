@@ -158,11 +158,11 @@ class Compiled:
                 return self._runner.run(x, arrays, deltas).parameters
 
             here, push = jax.linearize(parameters, zero)
-            observations = self._runner.around(here)
+            rows_at = {n: whiten.about(o) for n, o in self._runner.around(here).items()}
 
             def inner(deltas: Mapping[str, Any], row: jax.Array) -> jax.Array:
                 tangent = push(deltas)
-                shifts = {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
+                shifts = {n: at.shift(tangent[n]) for n, at in rows_at.items()}
                 return jnp.sum(row * self._runner.rows.stack(shifts))
 
             return jax.lax.map(lambda row: jax.grad(inner)(zero, row), rows)
@@ -187,13 +187,11 @@ class Compiled:
                 return self._runner.run(x, arrays, moved).parameters
 
             here, push = jax.linearize(parameters, zero)
-            observations = self._runner.around(here)
+            rows_at = {n: whiten.about(o) for n, o in self._runner.around(here).items()}
 
             def shifted(delta: dict[str, jax.Array]) -> jax.Array:
                 tangent = push(delta)
-                return self._runner.rows.stack(
-                    {n: whiten.shift(o, tangent[n]) for n, o in observations.items()}
-                )
+                return self._runner.rows.stack({n: at.shift(tangent[n]) for n, at in rows_at.items()})
 
             return jnp.moveaxis(jax.lax.map(shifted, deltas), 0, -1)
 
@@ -309,11 +307,12 @@ def _replicate(
 ) -> tuple[jax.Array, dict[str, jax.Array]]:
     """Draws of observations of these families: whitened residuals (n, cluster, row), and values (n, ...) by site."""
     observations = {n: whiten.Observation(f, parameters[n]) for n, f in families}
+    rows_at = {n: whiten.about(o) for n, o in observations.items()}
 
     def one(key: jax.Array) -> tuple[jax.Array, dict[str, jax.Array]]:
         split = zip(observations.items(), jax.random.split(key, len(observations)), strict=True)
         values = {name: whiten.sample(o, k) for (name, o), k in split}
-        return stacked([whiten.residual(o, values[n]) for n, o in observations.items()], gather), values
+        return stacked([at.residual(values[n]) for n, at in rows_at.items()], gather), values
 
     return jax.lax.map(one, keys)
 

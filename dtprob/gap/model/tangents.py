@@ -88,12 +88,12 @@ class Tangents:
                 return found.parameters, found.values
 
             here, push, values = jax.linearize(parameters, taken(x), has_aux=True)
-            observations = runner.around(here)
-            residual = {n: whiten.residual(o, values[n]) for n, o in observations.items()}
+            rows = {n: whiten.about(o) for n, o in runner.around(here).items()}
+            residual = {n: row.residual(values[n]) for n, row in rows.items()}
 
             def shifted(direction: jax.Array) -> jax.Array:
                 tangent = push(taken(direction))
-                return runner.rows.stack({n: whiten.shift(o, tangent[n]) for n, o in observations.items()})
+                return runner.rows.stack({n: row.shift(tangent[n]) for n, row in rows.items()})
 
             def put(i: Any, into: jax.Array) -> jax.Array:  # at once they would not fit in a CPU's cache
                 return into.at[i].set(shifted(basis[i]))

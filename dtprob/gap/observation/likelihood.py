@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 
@@ -12,6 +12,18 @@ from dtprob.gap.observation.residuals import Parameters
 
 type Rows = Callable[[Parameters, Any], jax.Array]
 type Move = Callable[[Parameters, jax.Array], Parameters]
+
+
+class About(NamedTuple):
+    """Rows at given parameters; what depends on these alone is computed once, before any loop over values or changes.
+
+    Attributes:
+        residual: values -> rows (component, *shape of the value).
+        shift: a change of each parameter -> what it adds to the rows.
+    """
+
+    residual: Callable[[Any], jax.Array]
+    shift: Callable[[Parameters], jax.Array]
 
 
 @dataclass(frozen=True)
@@ -23,6 +35,7 @@ class Likelihood:
         parameters: names of the parameters, each an attribute of the distribution.
         residual: (parameters, values) -> rows (component, *shape of the value).
         shift: (parameters, a change of each) -> what it adds to the rows.
+        about: parameters -> both, where something is computed from the parameters alone.
         located: how many of the rows, the first ones, stand for a location or probability; None for all.
         relocate: (parameters, step) -> parameters whose first row is shifted by the step; None where that is not possible.
         respread: the same for the first row that is no location.
@@ -56,3 +69,4 @@ class Likelihood:
     log_prob: Rows | None = None
     density: Rows | None = None
     impossible: Rows | None = None
+    about: Callable[[Parameters], About] | None = None

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpyro.distributions as dist
 
 from dtprob.effects.distributions import ComplexStudentT
-from dtprob.gap.observation import compound, discrete, limited, location_scale, moves, residuals
+from dtprob.gap.observation import compound, discrete, limited, location_scale, moves, numeric, residuals
 from dtprob.gap.observation.beta_binomial import BETA_BINOMIAL
 from dtprob.gap.observation.likelihood import Likelihood
 from dtprob.models.complex_normal import ComplexNormal
@@ -253,14 +253,20 @@ COMPOUNDS: Final[Mapping[str, Callable[[Likelihood, str], Likelihood]]] = {
 """What is made of another distribution, by the first word of its family, "Mixture Normal"."""
 
 
-@cache
 def likelihood(family: str) -> Likelihood:
-    """What is known of a family, one of `LIKELIHOODS` or a word of `COMPOUNDS` before one."""
+    """What is known of a family: one of `LIKELIHOODS`, a word of `COMPOUNDS` before one, or what `numeric` has met."""
+    own = numeric.met(family)
+    return _listed(family) if own is None else own[1]
+
+
+@cache
+def _listed(family: str) -> Likelihood:
     kind, _, base = family.rpartition(" ")
     return COMPOUNDS[kind](LIKELIHOODS[base], base) if kind else LIKELIHOODS[base]
 
 
 def is_discrete(family: str) -> bool:
     """Whether outcomes or counts are observed."""
-    known = getattr(dist, family.rsplit(" ", maxsplit=1)[-1], None)
+    own = numeric.met(family)
+    known: Any = getattr(dist, family.rsplit(" ", maxsplit=1)[-1], None) if own is None else own[0]
     return known is not None and bool(known.support.is_discrete)

@@ -11,6 +11,7 @@ import numpyro.distributions as dist
 from numpyro.distributions.discrete import ZeroInflatedProbs
 
 from dtprob.errors import InputError
+from dtprob.gap.observation import numeric
 from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, SAME, likelihood
 from dtprob.gap.observation.limited import TRUNCATED
 from dtprob.gap.observation.normal_scores import NORMAL_SCORES
@@ -47,12 +48,13 @@ def recognised(
     Raises:
         InputError: the diagnosis does not know the distribution.
     """
-    found = _compound(fn, value, counted) or _plain(fn)
+    found = _compound(fn, value, counted) or _plain(fn) or _own(fn)
     if found is None:
         raise InputError(
             f"observed site {name!r}",
             f"a distribution among {', '.join(LIKELIHOODS)}, a kind of these such as OrderedLogistic or NegativeBinomial2, "
-            f"or one of them that is {', '.join(COMPOUNDS)} (the last six: of {', '.join(NORMAL_SCORES)})",
+            f"one of them that is {', '.join(COMPOUNDS)} (the last six: of {', '.join(NORMAL_SCORES)}), or a class of "
+            "numbers with arg_constraints, log_prob, sample and a support that does not depend on its parameters",
             _described(fn),
             _INSTEAD.get(type(fn).__name__, "Declare the observation with one of these to diagnose its gap."),
         )
@@ -85,6 +87,12 @@ def _plain(fn: Any) -> _Found | None:
     if family is None:
         return None
     return _Found(family, {n: getattr(fn, n) for n in LIKELIHOODS[family].parameters})
+
+
+def _own(fn: Any) -> _Found | None:
+    """One that is known by its density and its draws."""
+    parameters = numeric.parameters_of(fn)
+    return None if parameters is None else _Found(numeric.family_of(type(fn)), parameters)
 
 
 def _compound(fn: Any, value: Any, counted: jax.Array | None) -> _Found | None:

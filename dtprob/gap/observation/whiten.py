@@ -9,11 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 
+from dtprob.gap.observation.likelihood import About
 from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.observation.recognise import recognised
 from dtprob.gap.observation.residuals import Parameters
@@ -104,16 +106,29 @@ def distribution(observed: Observation) -> Any:
     return likelihood(observed.family).make(**parameters)
 
 
+def about(observed: Observation) -> About:
+    """Residuals of values and shifts of changes, as `residual` and `shift` tell them, for loops over either."""
+    known = likelihood(observed.family)
+    if known.about is None:
+        rows = About(partial(known.residual, observed.parameters), partial(known.shift, observed.parameters))
+    else:
+        rows = known.about(observed.parameters)
+
+    def residuals(value: jax.Array) -> jax.Array:
+        value = value if known.log_prob is not None else _filled(observed, value)
+        return observed.masked(rows.residual(value))
+
+    return About(residuals, lambda change: observed.masked(rows.shift(change)))
+
+
 def residual(observed: Observation, value: jax.Array) -> jax.Array:
     """Whitened residuals, shape (component, *shape of the value): zero mean and identity covariance under the model."""
-    known = likelihood(observed.family)
-    value = value if known.log_prob is not None else _filled(observed, value)
-    return observed.masked(known.residual(observed.parameters, value))
+    return about(observed).residual(value)
 
 
 def shift(observed: Observation, tangent: Mapping[str, jax.Array]) -> jax.Array:
     """Whitened shift of a change of the parameters, shape (component, *shape of the value)."""
-    return observed.masked(likelihood(observed.family).shift(observed.parameters, dict(tangent)))
+    return about(observed).shift(dict(tangent))
 
 
 def location_rows(family: str, n_rows: int) -> int:

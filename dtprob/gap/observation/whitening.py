@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jax.scipy.linalg import solve_triangular
 
-from dtprob.gap.observation.likelihood import Likelihood, Move, Rows
+from dtprob.gap.observation.likelihood import About, Likelihood, Move, Rows
 from dtprob.gap.observation.residuals import Parameters
 
 _RIDGE: Final = 1e-10
@@ -46,17 +46,26 @@ def whitened(made: Likelihood, scores: Scores, move: Move | None) -> Likelihood:
         held = information + ridge[..., None, None] * jnp.eye(size)
         return jnp.linalg.cholesky(jnp.where(told[..., None, None], held, jnp.eye(size))), told
 
-    def residual(p: Parameters, value: jax.Array) -> jax.Array:
+    def about(p: Parameters) -> About:
         root, told = rooted(p)
-        columns = jnp.moveaxis(jnp.where(told, scores.of(p, value), 0.0), 0, -1)[..., None]
-        return jnp.moveaxis(solve_triangular(root, columns, lower=True)[..., 0], -1, 0)
 
-    def shift(p: Parameters, change: Parameters) -> jax.Array:
-        root, told = rooted(p)
-        return jnp.einsum("...ij,i...->j...", root, jnp.where(told, scores.change(p, change), 0.0))
+        def residual(value: Any) -> jax.Array:
+            columns = jnp.moveaxis(jnp.where(told, scores.of(p, value), 0.0), 0, -1)[..., None]
+            return jnp.moveaxis(solve_triangular(root, columns, lower=True)[..., 0], -1, 0)
+
+        def shift(change: Parameters) -> jax.Array:
+            return jnp.einsum("...ij,i...->j...", root, jnp.where(told, scores.change(p, change), 0.0))
+
+        return About(residual, shift)
 
     relocate: Move | None = None if move is None else lambda p, step: move(p, step / rooted(p)[0][..., 0, 0])
-    return replace(made, residual=residual, shift=shift, relocate=relocate)
+    return replace(
+        made,
+        residual=lambda p, value: about(p).residual(value),
+        shift=lambda p, change: about(p).shift(change),
+        about=about,
+        relocate=relocate,
+    )
 
 
 def made_of(base: Likelihood, make: Callable[..., Any], further: Mapping[str, int], mean: Any) -> Likelihood:

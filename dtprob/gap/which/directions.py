@@ -75,10 +75,10 @@ class Extra:
 def _scores(
     parameters: whiten.Parameters, values: jax.Array, shift: np.ndarray, *, family: str, first: int
 ) -> jax.Array:
-    null = whiten.Observation(family, parameters)
+    null = whiten.about(whiten.Observation(family, parameters))
 
     def one(value: jax.Array) -> jax.Array:
-        return whiten.residual(null, value)[first:].reshape(-1) @ shift
+        return null.residual(value)[first:].reshape(-1) @ shift
 
     return jax.lax.map(one, values)
 
