@@ -86,7 +86,7 @@ def ultra_wideband_profile(
         The mean power, (link, tap).
 
     Raises:
-        InputError: powers of another shape.
+        InputError: powers of another shape, or a negative spread.
 
     Source: exponential tails and powers of taps, A. Saleh, R. Valenzuela, IEEE JSAC 5 (1987); dense tail, A. Richter,
     thesis, TU Ilmenau (2005), 2.5.
@@ -95,6 +95,8 @@ def ultra_wideband_profile(
     if power is not None and power.shape != shape:
         remedy = "Give one path-set link per measured link, and powers from delay_profile"
         raise InputError("power", f"shape {shape} as (link, tap)", f"{tuple(power.shape)}", remedy)
+    if tail_spread_db < 0:
+        raise InputError("tail_spread_db", "0 dB or more", f"{tail_spread_db}", "Give the standard deviation")
     gain = traced_gain(paths, materials, law)
     each = site("path_power", jnp.real(gain) ** 2 + jnp.imag(gain) ** 2)
     delay = site("path_delay", paths.delay)

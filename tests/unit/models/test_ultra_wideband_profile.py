@@ -209,6 +209,8 @@ def test_uneven_subcarriers_and_foreign_powers_are_refused(paths):
         delay_profile(measured(channel[..., :1], np.array([0.0])))
     with pytest.raises(InputError, match=r"\(5, 49\)"):
         declare(ultra_wideband_profile, arguments(paths) | {"power": jnp.ones((4, 49))})
+    with pytest.raises(InputError, match="tail_spread_db"):
+        declare(ultra_wideband_profile, arguments(paths) | {"tail_spread_db": -3.0})
 
 
 def arguments(paths):
