@@ -15,6 +15,7 @@ import numpyro.distributions as dist
 from numpyro.distributions import biject_to, constraints
 
 from dtprob.gap.observation.likelihood import Likelihood, Move
+from dtprob.gap.observation.mixed import Mixed
 from dtprob.gap.observation.residuals import Parameters
 from dtprob.gap.observation.whitening import Scores, outer, whitened
 
@@ -96,8 +97,16 @@ def _likelihood(kind: Any) -> Likelihood:
 
 
 def _expected(fn: Any, of: Callable[[jax.Array], jax.Array]) -> jax.Array:
-    """The expectation of a function of values (*value) -> (*value, ...), place by place; memory is that of one."""
-    support: Any = type(fn).support
+    """The expectation of a function of values (*value) -> (*value, ...)."""
+    if not isinstance(fn, Mixed):
+        return _over(fn, of)
+    each = [(chance, _over(part, of)) for chance, part in fn.parts()]
+    return jnp.stack([c.reshape(c.shape + (1,) * (m.ndim - c.ndim)) * m for c, m in each]).sum(axis=0)
+
+
+def _over(fn: Any, of: Callable[[jax.Array], jax.Array]) -> jax.Array:
+    """The same place by place; memory is that of one."""
+    support: Any = fn.support
     middle, width = _range(fn, support)
     place = _whole(middle, width, support) if support.is_discrete else _real(middle, width, support)
 

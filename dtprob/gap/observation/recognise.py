@@ -14,6 +14,7 @@ from dtprob.errors import InputError
 from dtprob.gap.observation import numeric
 from dtprob.gap.observation.likelihoods import COMPOUNDS, LIKELIHOODS, SAME, likelihood
 from dtprob.gap.observation.limited import TRUNCATED
+from dtprob.gap.observation.mixed import mixed
 from dtprob.gap.observation.normal_scores import NORMAL_SCORES
 from dtprob.wrapping import unwrapped
 
@@ -98,7 +99,7 @@ def _own(fn: Any) -> _Found | None:
 def _compound(fn: Any, value: Any, counted: jax.Array | None) -> _Found | None:
     """One that is made of another."""
     if isinstance(fn, (dist.MixtureSameFamily, dist.MixtureGeneral)):
-        return _mixed(fn)
+        return _mixed(fn) or _mixed_otherwise(fn)
     if isinstance(fn, ZeroInflatedProbs):
         found = _plain(unwrapped(fn.base_dist)[0])
         if found is None or LIKELIHOODS[found.family].is_outcome:
@@ -125,6 +126,39 @@ def _mixed(fn: dist.MixtureSameFamily | dist.MixtureGeneral) -> _Found | None:
     given = {**parts.parameters, "log_weight": jnp.log(jnp.maximum(chance, least))}
     shapes = {n: jnp.broadcast_shapes(jnp.shape(v), chance.shape[-1:]) for n, v in given.items()}
     return _Found(parts.family, {n: jnp.broadcast_to(v, shapes[n]) for n, v in given.items()})
+
+
+def _mixed_otherwise(fn: dist.MixtureSameFamily | dist.MixtureGeneral) -> _Found | None:
+    """Parts of several families, or of one without quadratures of its own: parameters of each by its number."""
+    chance: Any = fn.mixing_distribution.probs
+    if isinstance(fn, dist.MixtureGeneral):
+        parts = [_single(unwrapped(part)[0]) for part in fn.component_distributions]
+    else:
+        shape = fn.component_distribution.batch_shape
+        parts = _numbered(_single(unwrapped(fn.component_distribution)[0]), shape, chance.shape[-1])
+    found = [part for part in parts if part is not None]
+    families = [part.family for part in found]
+    kind = mixed(families, [likelihood(family) for family in families]) if len(found) == len(parts) else None
+    if kind is None:
+        return None
+    log = jnp.log(jnp.maximum(jnp.asarray(chance), jnp.finfo(float).tiny))
+    odds = {f"odds_{k}": log[..., k] - log[..., 0] for k in range(1, len(found))}
+    own = {f"{k}_{n}": value for k, part in enumerate(found) for n, value in part.parameters.items()}
+    return _Found(numeric.family_of(kind), {**own, **odds})
+
+
+def _numbered(one: _Found | None, shape: tuple[int, ...], count: int) -> list[_Found | None]:
+    """The parts whose parameters lie along a last axis."""
+    if one is None:
+        return [None]
+    wide = {n: jnp.broadcast_to(jnp.asarray(value), shape) for n, value in one.parameters.items()}
+    return [_Found(one.family, {n: value[..., k] for n, value in wide.items()}) for k in range(count)]
+
+
+def _single(fn: Any) -> _Found | None:
+    """A part: one that stands alone, of single numbers whose parameters are such."""
+    found = _plain(fn) or _own(fn)
+    return None if found is None or fn.event_shape or likelihood(found.family).trailing else found
 
 
 def _stacked(parts: Sequence[Any]) -> _Found | None:

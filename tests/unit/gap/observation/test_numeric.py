@@ -75,6 +75,47 @@ def test_a_move_shifts_the_first_row_by_its_step_and_stays_where_the_parameter_m
     assert float(far.parameters["sight"].min()) > 0
 
 
+def late(n):
+    """Ranges by line of sight or late by an unknown delay."""
+    near = dist.Normal(spread_out(10.0, 90.0, n), spread_out(0.3, 1.0, n))
+    far = dist.Gamma(spread_out(4.0, 9.0, n), 0.1)
+    chance = jnp.stack([spread_out(0.2, 0.9, n), 1 - spread_out(0.2, 0.9, n)], -1)
+    return dist.MixtureGeneral(dist.Categorical(chance), [near, far], support=constraints.real)
+
+
+@pytest.mark.study
+def test_rows_of_a_mixture_of_two_families():
+    fn = late(4000)
+    one = observed(fn)
+    value = fn.sample(jax.random.key(5))
+    np.testing.assert_allclose(whiten.log_prob(one, value), fn.log_prob(value), rtol=1e-9)
+    rows = whiten.residual(one, value)
+    error = 4.5 / np.sqrt(4000)
+    assert rows.shape == (5, 4000)
+    assert np.abs(rows.mean(1)).max() < error
+    assert np.abs(np.cov(rows) - np.eye(5)).max() < 3 * error
+    replicate = whiten.sample(one, jax.random.key(6))
+    assert abs(replicate.mean() - value.mean()) < 4.5 * value.std() * np.sqrt(2 / 4000)
+
+
+def test_a_mixture_that_is_known_is_the_same_without_quadratures_of_its_own(monkeypatch):
+    parts = dist.Normal(jnp.stack([jnp.zeros(50), spread_out(1.0, 4.0, 50)], -1), jnp.asarray([1.0, 2.0]))
+    fn = dist.MixtureSameFamily(dist.Categorical(jnp.asarray([0.7, 0.3])), parts)
+    value = fn.sample(jax.random.key(7))
+    known = observed(fn)
+    monkeypatch.setattr("dtprob.gap.observation.recognise._mixed", lambda _: None)
+    own = observed(fn)
+    assert own.family != known.family
+    near = {n: jnp.full_like(v, 0.1) for n, v in own.parameters.items()}
+    told = (whiten.residual(own, value) * whiten.shift(own, near)).sum(0)
+    change = {"loc": 0.1, "scale": 0.1, "log_weight": jnp.asarray([0.0, 0.1])}
+    same = {n: jnp.broadcast_to(change[n], v.shape) for n, v in known.parameters.items()}
+    exact = (whiten.residual(known, value) * whiten.shift(known, same)).sum(0)
+    np.testing.assert_allclose(told, exact, rtol=1e-6, atol=1e-8)
+    information = [(whiten.shift(o, t) ** 2).sum(0) for o, t in ((own, near), (known, same))]
+    np.testing.assert_allclose(*information, rtol=2e-3)
+
+
 class Falling(Rice):
     """Its values depend on where its parameter is."""
 
