@@ -266,7 +266,7 @@ class Compiled:
         A third argument weights the priors of what clusters own (cluster,); all count fully by default.
         """
 
-        @quick_jit
+        @jax.jit
         def prior(x: Any, basis: jax.Array, weights: Any, arrays: Any) -> tuple[jax.Array, jax.Array]:
             slope, push = jax.linearize(lambda y: jax.grad(self._runner.log_prior)(y, weights, arrays), x)
             return slope, -jax.vmap(push)(basis)
