@@ -7,15 +7,17 @@ from itertools import compress
 from typing import Any, Final
 
 import numpy as np
+from numpyro.distributions import constraints
 
 from dtprob.errors import InputError
-from dtprob.gap.fitting.active import activate, basis
+from dtprob.gap.fitting.active import Active, activate, basis
 from dtprob.gap.fitting.at_end import at_end
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.fitting.states import are_states
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
+from dtprob.models.declaration import base_constraint
 
 UNSEEN: Final = "nothing observed depends on it"
 """What hides an effect that does nothing."""
@@ -30,6 +32,8 @@ _TAKES_PART: Final = 0.2
 _LOPSIDED: Final = 16
 _MANY: Final = 50_000
 """Times the data's rows, and rows, from which it is said what it costs that clusters are as long as the longest."""
+_CONTRADICTED: Final = 3.5
+"""Standard deviations from the middle of a prior from which a parameter is told, where no draw of the prior reaches it."""
 _SHOWN: Final = 4
 _STEP: Final = 0.01
 """Of a coordinate, to see what it acts on."""
@@ -143,7 +147,40 @@ def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
             f"what numpyro.factor adds ({names}) counts as a prior, and no gap is looked for in it; {remedy}"
         )
     found += [f"{name} is at the end of its prior" for name in at_end(problem, fitted)]
+    found += _contradicted(problem, fitted)
     return (*found, *_too_large(problem, fitted), *_misfit(problem, fitted), *_undetermined(problem, fitted))
+
+
+def _contradicted(problem: Problem, fitted: Fit) -> list[str]:
+    """Parameters that the data put where their prior hardly ever is: what explains a gap may have hidden in one.
+
+    Of those with bounds only what lies far above a lower one: near a bound, as a spread near 0, nothing is contradicted.
+    """
+    active = activate(problem, fitted.effects)
+    asked, index = ~are_states(problem, active), active.global_index
+    (middle, deviation), (least, largest) = problem.prior_middle, problem.prior_ends
+    away = np.abs(fitted.x - middle) / np.maximum(deviation, 1e-300)
+    beyond = (away > _CONTRADICTED) & (fitted.x > largest)
+    for block in (b for b in active.blocks if not b.local and b.owner is None):
+        kind = base_constraint(problem.declaration.sites[block.name].support)
+        if kind is constraints.real:
+            beyond[block.index] |= (away > _CONTRADICTED)[block.index] & (fitted.x < least)[block.index]
+        elif not isinstance(kind, type(constraints.positive)):
+            beyond[block.index] = False
+    told = [(owner, i) for owner, i, is_asked in zip(_names(active), index, asked, strict=True) if is_asked]
+    remedy = "its prior is wrong, or it takes up what is a gap"
+    found = [
+        f"the data put {owner} {away[i]:.1f} standard deviations from the middle of its prior: {remedy}"
+        for owner, i in told
+        if beyond[i]
+    ]
+    return [] if problem.known else found[:_SHOWN]
+
+
+def _names(active: Active) -> list[str]:
+    """What the free coordinates that clusters share are called."""
+    blocks = [b for b in active.blocks if not b.local]
+    return [b.name if b.size == 1 else f"{b.name}[{j}]" for b in blocks for j in range(b.size)]
 
 
 def lopsided(problem: Problem) -> list[str]:
@@ -193,9 +230,7 @@ def _undetermined(problem: Problem, fitted: Fit) -> list[str]:
     """Parameters that the data do not determine: too few clusters, no information, or only a combination of them."""
     active = activate(problem, fitted.effects)
     asked = ~are_states(problem, active)
-    blocks = [b for b in active.blocks if not b.local]
-    every = [b.name if b.size == 1 else f"{b.name}[{j}]" for b in blocks for j in range(b.size)]
-    owners = list(compress(every, asked))
+    owners = list(compress(_names(active), asked))
     if not owners:
         return []
     found = []

@@ -77,6 +77,29 @@ def test_a_sound_fit_is_not_noted():
     assert noted(line, draw("line")) == ()
 
 
+@pytest.mark.parametrize(("turned", "told"), [(0.02, False), (0.15, True), (-0.15, True)])
+def test_a_parameter_that_the_data_put_where_its_prior_never_is_is_told(turned, told):
+    """An array that is said to be turned by 0.03 rad at most takes up what an effect would say."""
+
+    def bearings(direction, seen=None):
+        turn = numpyro.sample("turn", dist.Normal(0.0, 0.03))
+        spread = numpyro.sample("spread", dist.HalfNormal(1.0))
+        with numpyro.plate("link", len(direction)):
+            each = numpyro.deterministic("each", direction + turn)
+            numpyro.sample("seen", dist.Normal(each, spread), obs=seen)
+
+    rng = np.random.default_rng(0)
+    direction = rng.uniform(-1, 1, 300)
+    data = {"direction": direction, "seen": direction + turned + rng.normal(0, 1e-3, 300)}
+    effect = Effect(
+        "turned", {"each": lambda v, p, _: v + p["by"]}, (Parameter("by", dist.Normal(0.0, 0.2)),)
+    )
+    found = noted(bearings, data, [effect])
+    assert [line.startswith("the data put turn ") for line in found] == [
+        True
+    ] * told  # and none of the small spread
+
+
 def test_fewer_clusters_than_parameters():
     x = inputs(n_link=4)
     data = {"x": jnp.asarray(x), "y": jnp.asarray(np.cos(x))}
