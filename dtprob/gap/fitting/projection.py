@@ -161,11 +161,13 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     shared = known_of(slope[active.global_index], prior_global, told[active.global_index])
     own = known_of(slope[active.local_index], prior_local, told[active.local_index])
     inner = are_states(problem, active)
-    w_global, centre = (
-        _centred_on_states(problem, active, fitted.x, directions, w=w_global, inner=inner)
-        if problem.volume is not None and inner.any()
-        else _centred(problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own)
+    w_global, centre = _centred(
+        problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own
     )
+    if problem.volume is not None and inner.any():
+        w_global, centre = _centred_on_states(
+            problem, active, fitted.x, directions, w=w_global, inner=inner, own=own
+        )
     transposed = np.swapaxes(w_local, 1, 2)
     local = transposed @ w_local + prior_local
     local_inverse = np.linalg.inv(positive(local)) if local.shape[-1] else local
@@ -187,10 +189,12 @@ def _centred_on_states(
     *,
     w: np.ndarray,
     inner: np.ndarray,
+    own: Known,
 ) -> tuple[np.ndarray, Centred | None]:
-    """The same where the global coordinates of a mask are states that are integrated out."""
+    """The same, of tangents that are centred on clusters' own unknowns, where states are integrated out, by a mask."""
     there, at = x.copy(), active.global_index[inner]
     there[at] = problem.prior_middle[0][at]
+    there[active.local_index] -= own.deviation
     moved = np.asarray(problem.compiled.linearised(there, directions[: len(inner)])[1])
     if not np.isfinite(moved).all():
         return w, None

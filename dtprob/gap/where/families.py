@@ -7,32 +7,22 @@ are shared along some axes, that vary smoothly, as a ripple or in a cycle along 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final, final
 
 import jax.numpy as jnp
 import numpy as np
-from scipy import sparse
 
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import likelihood
-from dtprob.gap.where.curves import OWN_TURNS, Curves, cycles, stretches
+from dtprob.gap.where.curves import Curves
+from dtprob.gap.where.ordered import COLUMNS, Along, in_order
 from dtprob.gap.where.quantities import Quantity
 from dtprob.models.axes import is_unnamed
 
 _BAND: Final = 6
 """Entries of an axis from which it may be a band, whose mirror frequency an imbalance of I and Q brings in."""
-_ROWS: Final = 8
-"""Positions of a second axis from which rows may follow one another from cluster to cluster."""
-_COLUMNS: Final = 16
-"""Entries of a last axis up to which each is looked at."""
-_MOST_OF_EACH: Final = 1 << 16
-"""Entries of a site of which stretches, and what repeats in each cluster, are looked at."""
-_MOST_BLOCKS: Final = 1 << 13
-"""Stretches of one axis by those of another that are looked at."""
-
-type Along = Callable[[str, int], Sequence[Curves]]
 type Over = Sequence[tuple[Quantity, Sequence[Curves]]]
 
 
@@ -221,69 +211,24 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
     for i, axis in enumerate(site.axes):
         for found in along(axis, site.value.shape[i]):
             yield Pattern(found.label, (i,), found)
-            if i < last and 1 < site.value.shape[last] <= _COLUMNS:
+            if i < last and 1 < site.value.shape[last] <= COLUMNS:
                 yield Pattern(f"{found.label} x {site.axes[last]}", (i, last), found)
     for quantity, all_curves in over:
         if (kept := quantity.kept(site.axes, site.value.shape)) is not None:
             yield from (Pattern(found.label, kept, found) for found in all_curves)
             rest = tuple(range(len(kept), site.value.ndim))
-            classes = all(is_unnamed(site.axes[i]) for i in rest) and _size(site, rest) <= _COLUMNS
+            classes = all(is_unnamed(site.axes[i]) for i in rest) and _size(site, rest) <= COLUMNS
             if rest and (classes or not quantity.ordered) and kept == tuple(range(len(kept))):
                 each = " x ".join(site.axes[i] for i in rest)
                 yield from (Pattern(f"{found.label} x {each}", kept + rest, found) for found in all_curves)
-    yield from _cycles(site)
-    yield from _stretches(site)
+    yield from (
+        Pattern(found.label, kept, found) for kept, found in in_order(along, site.axes, site.value.shape)
+    )
 
 
 def _size(site: Site, axes: Sequence[int]) -> int:
     """Positions along some axes."""
     return int(np.prod([site.value.shape[i] for i in axes], dtype=int))
-
-
-def _stretches(site: Site) -> Iterator[Pattern]:
-    """Stretches of the last axis of what lies along one or two, those of each position and each stretch of the first."""
-    shape = site.value.shape
-    if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_EACH:
-        return
-    for found in stretches(shape[-1], site.axes[-1]):
-        if len(shape) == 1:
-            yield Pattern(found.label, (0,), found)
-            continue
-        each = _of_each(found, site)
-        yield Pattern(each.label, (0, 1), each)
-        for first in stretches(shape[0], site.axes[0]):
-            if first.extent[0] * found.extent[0] <= _MOST_BLOCKS:
-                blocks = _crossed(f"block of {site.axes[0]} and {site.axes[1]}", first, found)
-                yield Pattern(blocks.label, (0, 1), blocks)
-
-
-def _of_each(curves: Curves, site: Site) -> Curves:
-    """Curves along the last of a site's two axes, each position of the first with weights of its own."""
-    each = sparse.kron(sparse.identity(site.value.shape[0]), curves.values)
-    return Curves(f"{curves.label} x {site.axes[0]}", sparse.csr_matrix(each))
-
-
-def _crossed(label: str, first: Curves, second: Curves) -> Curves:
-    """Every stretch of a first axis with every one of a second."""
-    places = tuple(f"{one}, {other}" for one, other in itertools.product(first.places, second.places))
-    return Curves(
-        label, sparse.csr_matrix(sparse.kron(first.values, second.values)), overlaps=True, places=places
-    )
-
-
-def _cycles(site: Site) -> Iterator[Pattern]:
-    """What repeats along an axis, or along the rows of all clusters in their order, entry by entry of the other axes."""
-    shape, kept = site.value.shape, tuple(range(site.value.ndim))
-    for i, axis in enumerate(site.axes):
-        for found in cycles(shape[i], axis):
-            yield Pattern(found.label, (i,), found)
-    if len(shape) > 1 and shape[1] >= _ROWS and np.prod(shape[2:]) <= _COLUMNS:
-        for found in cycles(shape[0] * shape[1], f"{site.axes[0]} and {site.axes[1]}"):
-            yield Pattern(found.label, kept, found)
-    if len(shape) == 2 and np.prod(shape) <= _MOST_OF_EACH:
-        for found in cycles(shape[1], site.axes[1], turns=OWN_TURNS):
-            each = _of_each(found, site)
-            yield Pattern(each.label, kept, each)
 
 
 def _kept_axes(shape: tuple[int, ...]) -> Iterator[tuple[int, ...]]:

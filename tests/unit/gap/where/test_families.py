@@ -10,7 +10,7 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.where.curves import curves, cycles
+from dtprob.gap.where.curves import Curves, curves, cycles, grouped
 from dtprob.gap.where.families import deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import family_test
 from dtprob.gap.where.quantities import Quantity, groups, quantity
@@ -291,6 +291,37 @@ def test_a_cycle_of_a_few_clusters_own_is_noticed_where_none_of_them_shows_it():
     step = own.family.step(own.first[0], own.variance, site.value)
     np.testing.assert_allclose(step[:, :24], step[:, 144:], atol=1e-12)
     assert np.corrcoef(step[::5, :24].mean(0), np.arange(24) >= 20)[0, 1] > 0.8
+
+
+@pytest.mark.parametrize("turned", [False, True])
+def test_what_a_group_does_at_some_hours_is_noticed(turned):
+    """The cells of one of five vendors at four hours of forty, two standard deviations; either axis first."""
+    rng = np.random.default_rng(10)
+    vendor = np.arange(30) % 5
+    gradients = rng.normal(size=(200, 30, 40))
+    gradients[0][np.ix_(vendor == 3, np.arange(17, 21))] += 2.0
+    words = tuple(f"vendor {k}" for k in range(5))
+    by = Curves("by vendor", grouped(vendor), column="vendor", plain=True, places=words)
+    smooth = Curves("smooth in hour", np.cos(np.pi * np.outer(np.arange(1, 5), np.arange(40) + 0.5) / 40))
+    along = {"cell": (by,), "hour": (smooth,)}
+    axes = ("cell", "hour")
+    if turned:
+        gradients, axes = np.swapaxes(gradients, 1, 2), axes[::-1]
+    site = deterministic("load", axes, np.ones(gradients.shape[1:]), gradients)
+    found = {f.label: family_test(f, s) for f, s in families(lambda axis, _: along[axis], (), site)}
+    each, course = found["additive, by vendor x hour"], found["additive, smooth in hour by vendor"]
+    assert each.variance.shape == (200,)
+    assert course.variance.shape == (20,)
+    assert each.p_value < 1e-2
+    assert course.p_value < 1e-2
+    place = each.family.pattern.curves.places[int(np.argmax(each.first[0]))]
+    vendor_3, hour = sorted(place.split(", "), reverse=True)
+    assert vendor_3 == "vendor 3"
+    assert int(hour.removeprefix("hour ")) in range(17, 21)
+    step = each.family.step(each.first[0], each.variance, site.value)
+    step = step.T if turned else step
+    assert (step[3] == step[8]).all()
+    assert step[3, 17:21].mean() > 0.5
 
 
 def test_what_whole_numbers_tell_apart_is_told_of_each_outcome(problem):
