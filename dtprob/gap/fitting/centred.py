@@ -14,6 +14,8 @@ from jaxtyping import Float
 
 from dtprob.gap.fitting.columns import rows_of_each, scores_of_each
 
+_FAINT: Final = 1e-6
+"""Share of the largest curvature, each unknown in units of its own, below which what moves together moves nothing."""
 MOST: Final = 128
 """Own unknowns of a cluster up to which scores are centred."""
 
@@ -39,6 +41,16 @@ class Centred(NamedTuple):
     def of(cls, x: np.ndarray, own: np.ndarray, there: np.ndarray) -> Centred:
         """From the centre, and tangents (cluster, row, own) of clusters' own unknowns at the fit and there."""
         return cls(x, own, per_unit(own), per_unit(there))
+
+    @property
+    def amplified(self) -> float:
+        """How many times larger rows with the same scores are at the centre than at the fit."""
+        return float(
+            max(
+                np.linalg.norm(t, 2) / np.linalg.norm(h, 2)
+                for h, t in zip(self.here, self.there, strict=True)
+            )
+        )
 
     def without_own(self, rows: np.ndarray) -> np.ndarray:
         """Rows (n, cluster, row) less what own unknowns could make of them."""
@@ -69,4 +81,4 @@ def per_unit(own: np.ndarray) -> np.ndarray:
     size = np.sqrt((own**2).sum(axis=1, keepdims=True))
     size = np.where(size > 0, size, 1.0)
     unit = own / size
-    return unit @ np.linalg.pinv(np.swapaxes(unit, 1, 2) @ unit, hermitian=True) / size
+    return unit @ np.linalg.pinv(np.swapaxes(unit, 1, 2) @ unit, rcond=_FAINT, hermitian=True) / size

@@ -23,6 +23,10 @@ _TOGETHER: Final = 32
 """Clusters whose projected columns are held at once."""
 _FEWEST_DRAWN: Final = 64
 """Numbers of a replicate that are drawn at least."""
+_MOST_BESIDE: Final = 1 << 24
+"""Numbers that the tangents of all clusters' own unknowns take beside one another, at most."""
+_AMPLIFIED: Final = 5.0
+"""Times that rows of the same scores are larger at the centre of states, from which on scores are not taken there."""
 _ROUNDING: Final = 1e-9
 """What is left of a coordinate after its fit is taken back, as a share of the fit, is zero below this."""
 
@@ -161,13 +165,13 @@ def project(problem: Problem, fitted: fitting.Fit) -> Projection:
     shared = known_of(slope[active.global_index], prior_global, told[active.global_index])
     own = known_of(slope[active.local_index], prior_local, told[active.local_index])
     inner = are_states(problem, active)
-    w_global, centre = _centred(
-        problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own
-    )
-    if problem.volume is not None and inner.any():
-        w_global, centre = _centred_on_states(
-            problem, active, fitted.x, directions, w=w_global, inner=inner, own=own
+    w_global, centre = (
+        _centred_on_states(
+            problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, inner=inner, own=own
         )
+        if problem.volume is not None and inner.any()
+        else _centred(problem, active, fitted.x, directions, w_global=w_global, w_local=w_local, own=own)
+    )
     transposed = np.swapaxes(w_local, 1, 2)
     local = transposed @ w_local + prior_local
     local_inverse = np.linalg.inv(positive(local)) if local.shape[-1] else local
@@ -187,26 +191,42 @@ def _centred_on_states(
     x: np.ndarray,
     directions: np.ndarray,
     *,
-    w: np.ndarray,
+    w_global: np.ndarray,
+    w_local: np.ndarray,
     inner: np.ndarray,
     own: Known,
 ) -> tuple[np.ndarray, Centred | None]:
-    """The same, of tangents that are centred on clusters' own unknowns, where states are integrated out, by a mask."""
+    """The same where the global coordinates of a mask are states that are integrated out, with what clusters own beside.
+
+    Where data hardly depend on states at their centre, as on the weights of a network of which all are zero there, scores
+    stay as they are at the fit.
+    """
+    beside = w_local.size * len(w_local) <= _MOST_BESIDE
     there, at = x.copy(), active.global_index[inner]
     there[at] = problem.prior_middle[0][at]
-    there[active.local_index] -= own.deviation
-    moved = np.asarray(problem.compiled.linearised(there, directions[: len(inner)])[1])
+    if beside:
+        there[active.local_index] -= own.deviation
+    moved = np.asarray(problem.compiled.linearised(there, directions)[1])
     if not np.isfinite(moved).all():
-        return w, None
-    centre = Centred.of(there, _together(w[..., inner]), _together(moved[..., inner]))
-    columns = w.copy()
-    columns[..., ~inner] = centre.columns(w[..., ~inner], moved[..., ~inner])
+        return w_global, None
+    split = len(inner)
+    parts = ((w_global, w_local), (moved[..., :split], moved[..., split:]))
+    levels = slice(None if beside else 0)
+    centre = Centred.of(there, *(_together(shared[..., inner], each[..., levels]) for shared, each in parts))
+    if centre.amplified > _AMPLIFIED:
+        return w_global, None
+    columns = w_global.copy()
+    columns[..., ~inner] = centre.columns(w_global[..., ~inner], moved[..., :split][..., ~inner])
     return columns, centre
 
 
-def _together(w: np.ndarray) -> np.ndarray:
-    """Tangents (1, cluster and row, k) of what acts on all clusters."""
-    return w.reshape(1, -1, w.shape[-1])
+def _together(shared: np.ndarray, own: np.ndarray) -> np.ndarray:
+    """Tangents (1, cluster and row, k) of what acts on all clusters, and of what acts on each alone."""
+    clusters, rows, each = own.shape
+    apart = np.zeros((clusters, rows, clusters, each))
+    apart[np.arange(clusters), :, np.arange(clusters)] = own
+    columns = (shared.reshape(clusters * rows, -1), apart.reshape(clusters * rows, -1))
+    return np.concatenate(columns, axis=1)[None]
 
 
 def _centred(
