@@ -45,12 +45,7 @@ class Centred(NamedTuple):
     @property
     def amplified(self) -> float:
         """How many times larger rows with the same scores are at the centre than at the fit."""
-        return float(
-            max(
-                np.linalg.norm(t, 2) / np.linalg.norm(h, 2)
-                for h, t in zip(self.here, self.there, strict=True)
-            )
-        )
+        return float(np.linalg.norm(self.there) / np.linalg.norm(self.here))
 
     def without_own(self, rows: np.ndarray) -> np.ndarray:
         """Rows (n, cluster, row) less what own unknowns could make of them."""

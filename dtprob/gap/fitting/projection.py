@@ -23,8 +23,8 @@ _TOGETHER: Final = 32
 """Clusters whose projected columns are held at once."""
 _FEWEST_DRAWN: Final = 64
 """Numbers of a replicate that are drawn at least."""
-_MOST_BESIDE: Final = 1 << 24
-"""Numbers that the tangents of all clusters' own unknowns take beside one another, at most."""
+_MOST_BESIDE: Final = 1024
+"""Own unknowns of all clusters up to which they are centred together with states."""
 _AMPLIFIED: Final = 5.0
 """Times that rows of the same scores are larger at the centre of states, from which on scores are not taken there."""
 _ROUNDING: Final = 1e-9
@@ -201,7 +201,7 @@ def _centred_on_states(
     Where data hardly depend on states at their centre, as on the weights of a network of which all are zero there, scores
     stay as they are at the fit.
     """
-    beside = w_local.size * len(w_local) <= _MOST_BESIDE
+    beside = active.local_index.size <= _MOST_BESIDE
     there, at = x.copy(), active.global_index[inner]
     there[at] = problem.prior_middle[0][at]
     if beside:

@@ -8,6 +8,7 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.effects import Effect, Parameter
+from dtprob.gap.fitting.bootstrap import _site_gradients, observed_rows
 from dtprob.gap.fitting.integrated import based
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.fitting.states import states
@@ -76,3 +77,33 @@ def test_what_acts_as_levels_do_is_told_as_by_generalised_least_squares(fitted):
     exact = generalised(problem.compiled.sites(fit.x), load)
     assert exact < -3
     assert abs(z / exact - 1) < 0.1
+
+
+def network(east, north, expected=None):
+    """A surface by a small network, whose weights multiply one another: at zero the data say nothing of any."""
+    with numpyro.plate("hidden", 4):
+        inner = numpyro.sample("inner", dist.Normal(0.0, 1.0).expand([3]).to_event(1))
+        outer = numpyro.sample("outer", dist.Normal(0.0, 1.0))
+    noise = numpyro.sample("noise", dist.LogNormal(-1.0, 0.5))
+    features = jnp.stack([east, north, jnp.ones_like(east)], -1)
+    rate = numpyro.deterministic("rate", jnp.tanh(features @ inner.T) @ outer)
+    with numpyro.plate("reading", len(east)):
+        numpyro.sample("expected", dist.Normal(rate, noise), obs=expected)
+
+
+def test_scores_stay_at_the_fit_where_nothing_depends_on_states_at_their_centre():
+    """Taken at the centre they were made of rows a thousand times too large, and every effect was lost in these."""
+    rng = np.random.default_rng(5)
+    east, north = rng.uniform(-1, 1, (2, 400))
+    some = rng.uniform(size=400) < 0.2
+    seen = np.tanh(2 * east - north) - 0.5 * some + 0.3 * rng.normal(size=400)
+    problem = Problem(network, {"east": east, "north": north, "expected": seen}, [])
+    start = based(problem, jax.random.key(0))
+    problem, fit = start.problem, start.fitted
+    assert {b.name for b in states(problem).blocks} == {"inner", "outer"}
+    projection = project(problem, fit)
+    rows = observed_rows(problem, fit, projection)[1][None]
+    centred = np.asarray(_site_gradients(problem, fit, projection, rows)["rate"][0])
+    at_the_fit = np.asarray(problem.compiled.site_gradient(fit.x, rows)["rate"][0])
+    assert at_the_fit[some].sum() < -50
+    assert abs(centred[some].sum() / at_the_fit[some].sum() - 1) < 0.1
