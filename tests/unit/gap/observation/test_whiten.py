@@ -447,9 +447,9 @@ def test_mixtures_of_a_list_of_parts():
     np.testing.assert_allclose(
         whiten.log_prob(observed, jnp.arange(4.0)), fn.log_prob(jnp.arange(4.0)), rtol=1e-6
     )
-    unlike = dist.MixtureGeneral(weights, [parts[0], dist.StudentT(3.0)], support=dist.constraints.real)
-    with pytest.raises(InputError, match="MixtureGeneral"):
-        whiten.observation(unlike, jnp.arange(4.0), "y")
+    counted = dist.MixtureGeneral(weights, [parts[0], dist.Poisson(3.0)], support=dist.constraints.real)
+    with pytest.raises(InputError, match="MixtureGeneral"):  # numbers and counts have no density in common
+        whiten.observation(counted, jnp.arange(4.0), "y")
 
 
 @pytest.mark.parametrize("means", [(0.05, 3.0, 400.0), pytest.param((3e5,), marks=pytest.mark.study)])
@@ -590,7 +590,7 @@ def test_certain_bernoulli_stays_finite(logit):
     assert np.all(np.isfinite(whiten.shift(observed, {"logits": jnp.ones(1)})))
 
 
-def test_kinds_of_a_known_distribution_are_known_and_ones_own_are_not():
+def test_kinds_of_a_known_distribution_are_known_and_ones_own_are_taken_by_their_density():
     cuts = jnp.array([-1.0, 0.5, 2.0])
     ordered = dist.OrderedLogistic(jnp.array([0.3, -0.2]), cuts)
     found = whiten.observation(ordered, jnp.array([1, 3]), "y")
@@ -599,12 +599,15 @@ def test_kinds_of_a_known_distribution_are_known_and_ones_own_are_not():
         whiten.log_prob(found, jnp.array([1, 3])), ordered.log_prob(jnp.array([1, 3])), rtol=1e-5
     )
 
-    class Clipped(dist.Normal):
-        def log_prob(self, value):
-            return super().log_prob(jnp.clip(value, -1.0, 1.0))
+    class Scaled(dist.Normal):
+        """Of another scale than what it is derived from."""
 
-    with pytest.raises(InputError, match="Clipped"):
-        whiten.observation(Clipped(0.0, 1.0), jnp.zeros(3), "y")
+        def log_prob(self, value):
+            return super().log_prob(value / 2) - jnp.log(2.0)
+
+    found = whiten.observation(Scaled(0.0, 1.0), jnp.full(3, 2.0), "y")
+    assert found.family.endswith("Scaled")
+    np.testing.assert_allclose(whiten.log_prob(found, jnp.full(3, 2.0)), dist.Normal(0.0, 2.0).log_prob(2.0))
 
 
 @pytest.mark.parametrize("concentration", [1e2, 1e4, 1e6, 1e9])
