@@ -156,6 +156,8 @@ def _contradicted(problem: Problem, fitted: Fit) -> list[str]:
 
     Of those with bounds only what lies far above a lower one: near a bound, as a spread near 0, nothing is contradicted.
     """
+    if problem.known:
+        return []
     active = activate(problem, fitted.effects)
     asked, index = ~are_states(problem, active), active.global_index
     (middle, deviation), (least, largest) = problem.prior_middle, problem.prior_ends
@@ -174,7 +176,7 @@ def _contradicted(problem: Problem, fitted: Fit) -> list[str]:
         for owner, i in told
         if beyond[i]
     ]
-    return [] if problem.known else found[:_SHOWN]
+    return found[:_SHOWN]
 
 
 def _names(active: Active) -> list[str]:

@@ -107,12 +107,7 @@ class Problem:
             self._lay_out()
 
     def _declare(self, model: Model, static: Any) -> None:
-        for name in (
-            "_prior_quantiles",
-            "prior_middle",
-            "prior_ends",
-            "usual",
-        ):  # of sites that may have another name now
+        for name in ("_prior_quantiles", "prior_middle", "usual"):  # of sites that may have another name now
             self.__dict__.pop(name, None)
         self.model = model
         self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
@@ -344,25 +339,24 @@ class Problem:
 
     @cached_property
     def _prior_quantiles(self) -> np.ndarray:
-        """Of prior draws of each coordinate (score, dimension), at the normal scores `_SCORES`."""
+        """Of prior draws of each coordinate (score, dimension): the least, those at `_SCORES`, and the largest."""
         draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
-        return np.quantile(draws, special.ndtr(_SCORES), axis=0)
+        return np.quantile(draws, [0.0, *special.ndtr(_SCORES), 1.0], axis=0)
 
     @cached_property
     def prior_middle(self) -> tuple[np.ndarray, np.ndarray]:
         """Median and standard deviation, by the middle eight tenths of the prior, of each coordinate (dimension,)."""
-        low, middle, high = (self._prior_quantiles[_SCORES.index(s)] for s in (-_TENTH, 0.0, _TENTH))
+        low, middle, high = (self._prior_quantiles[1 + _SCORES.index(s)] for s in (-_TENTH, 0.0, _TENTH))
         return middle, (high - low) / (2 * _TENTH)
 
-    @cached_property
+    @property
     def prior_ends(self) -> tuple[np.ndarray, np.ndarray]:
         """The least and the largest of a thousand prior draws of each coordinate (dimension,)."""
-        draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
-        return draws.min(axis=0), draws.max(axis=0)
+        return self._prior_quantiles[0], self._prior_quantiles[-1]
 
     def prior_score(self, x: np.ndarray, index: np.ndarray) -> np.ndarray:
         """Normal scores among prior draws, at most 3 from 0, of some coordinates of a point, all of the base model."""
-        return np.array([np.interp(x[i], self._prior_quantiles[:, i], _SCORES) for i in index])
+        return np.array([np.interp(x[i], self._prior_quantiles[1:-1, i], _SCORES) for i in index])
 
     @cached_property
     def usual(self) -> dict[str, tuple[float, float]]:
