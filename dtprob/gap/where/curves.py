@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple, cast
 
 import numpy as np
@@ -13,6 +13,7 @@ from scipy import sparse, stats
 from dtprob.effects.covering import covering
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.data_columns import columns
+from dtprob.gap.where.windows import windows, windows_of_values, within
 
 SMOOTH_FROM: Final = 6
 """Positions, or values, along which something may vary smoothly."""
@@ -32,6 +33,8 @@ _NEAREST: Final = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Places in the plane of two columns about which a compact region is looked for, and shares of the positions in one."""
 MOST_PAIRS: Final = 6
 GROUPS: Final = 32
+_MOST_WINDOWS: Final = 1 << 13
+"""Windows in groups that are looked at."""
 _SHARED: Final = 8
 """Values of a real column up to which it is looked at by value too, and positions that share one of them on average."""
 _CELL: Final = 4
@@ -109,13 +112,22 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     yield from _ripples(axis, place, _FINEST)
     found = columns(problem, axis, size)
     made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}
-    places = {n: groups_in_words(index, {n: found[n]}) for n, index in made.items()}
+    by = {n: _by(n, index, found[n]) for n, index in made.items()}
     for name, column in found.items():
         if _is_ordered(column):
             yield from over_column(name, column, _FINEST if len(found) <= _FEW else _COARSE)
-        if name in made:
-            yield Curves(f"by {name}", grouped(made[name]), column=name, plain=True, places=places[name])
-    yield from _pairs(found, made, places, size)
+        if name in by:
+            yield by[name]
+    yield from _pairs(found, by, size)
+    yield from itertools.islice(_cells(found, made), MOST_PAIRS)
+    for group in itertools.islice(by.values(), 0 if axis in found else MOST_PAIRS):
+        yield from _in_groups(group, *_between(f"stretch of {axis}", axis, np.arange(size)))
+
+
+def _by(name: str, index: np.ndarray, column: np.ndarray) -> Curves:
+    """By the groups (size,) that a column makes of positions."""
+    places = groups_in_words(index, {name: column})
+    return Curves(f"by {name}", grouped(index), column=name, plain=True, places=places)
 
 
 def _is_ordered(column: np.ndarray) -> bool:
@@ -138,18 +150,12 @@ def _makes_groups(column: np.ndarray) -> bool:
     return not _is_ordered(column) or (count <= GROUPS and _SHARED * count <= len(column))
 
 
-def _pairs(
-    found: Mapping[str, np.ndarray],
-    made: Mapping[str, np.ndarray],
-    places: Mapping[str, tuple[str, ...]],
-    size: int,
-) -> Iterator[Curves]:
-    """What varies with two columns (size,) together: smooth over both, along one in each group, by groups of both.
+def _pairs(found: Mapping[str, np.ndarray], by: Mapping[str, Curves], size: int) -> Iterator[Curves]:
+    """What varies with two columns (size,) together: smooth over both, along one in each group of the other.
 
     Args:
         found: the columns.
-        made: of those that make groups, the group of each position.
-        places: the groups of each of these, in words.
+        by: groups of those that make some.
         size: positions.
     """
     smooth = [n for n, c in found.items() if _is_ordered(c) and np.issubdtype(c.dtype, np.floating)]
@@ -159,11 +165,22 @@ def _pairs(
         yield Curves(f"over {one} and {other}", products.reshape(-1, size))
         yield _neighbourhoods((one, other), np.stack([found[one], found[other]], axis=1).astype(float))
     for along in (smooth, [n for n, c in found.items() if _is_rising(c)]):
-        crossed = [(one, other) for one, other in itertools.product(along, made) if one != other]
+        crossed = [(one, other) for one, other in itertools.product(along, by) if one != other]
         for one, other in crossed[:MOST_PAIRS]:
-            lines = grouped(made[other]).multiply(_line(found[one])).tocsr()
-            yield Curves(f"along {one} by {other}", lines, plain=True, places=places[other])
-    yield from itertools.islice(_cells(found, made), MOST_PAIRS)
+            lines = sparse.csr_matrix(by[other].values).multiply(_line(found[one])).tocsr()
+            yield replace(by[other], label=f"along {one} by {other}", column=None, values=lines)
+            yield from _in_groups(by[other], *_between(f"between two values of {one}", one, found[one]))
+
+
+def _in_groups(group: Curves, *some: Curves) -> Iterator[Curves]:
+    """Windows along an axis in each group of its positions; not where there would be very many."""
+    for found in some:
+        if group.extent[0] * found.extent[0] <= _MOST_WINDOWS:
+            values = within(sparse.csr_matrix(group.values), sparse.csr_matrix(found.values))
+            several = np.flatnonzero(np.diff(values.indptr) > 1)
+            words = [f"{one}, {other}" for one, other in itertools.product(group.places, found.places)]
+            places = tuple(words[i] for i in several)
+            yield Curves(f"{found.label} {group.label}", values[several], overlaps=True, places=places)
 
 
 def _neighbourhoods(over: tuple[str, str], place: np.ndarray) -> Curves:
@@ -220,12 +237,8 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
     """Half-overlapping stretches of an axis of some positions, 2, 4, 8 ... long, each with a weight; none of short axes."""
     if size < SMOOTH_FROM:
         return ()
-    lengths = [2**k for k in range(1, int(np.log2(size)))]
-    windows = [(low, low + n) for n in lengths for low in range(0, size - n + 1, n // 2)]
-    weight = np.repeat(np.arange(len(windows)), [stop - low for low, stop in windows])
-    position = np.concatenate([np.arange(*window) for window in windows])
-    values = sparse.csr_matrix((np.ones(len(weight)), (weight, position)), (len(windows), size))
-    places = tuple(f"{over} {low} to {stop - 1}" for low, stop in windows)
+    values, ends = windows(size)
+    places = tuple(f"{over} {low} to {stop - 1}" for low, stop in ends)
     return (Curves(f"stretch of {over}", values, places=places),)
 
 
@@ -236,10 +249,19 @@ def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     steps = np.where(column > cuts[:, None], 0.5, -0.5)
     places = tuple(f"beyond {cut:.4g} of {name}" for cut in cuts)
     yield Curves(f"beyond a value of {name}", steps, overlaps=True, places=places)
+    yield from _between(f"between two values of {name}", name, column)
     finest = min(
         finest, len(np.unique(column)) - 1
     )  # finer ones are the same again at the values that there are
     yield from _ripples(name, (column - column.min()) / np.ptp(column), finest)
+
+
+def _between(label: str, name: str, column: np.ndarray) -> Iterator[Curves]:
+    """Between two values of a column (size,), as in the shadow of something; not where it takes few."""
+    values, ends = windows_of_values(column, SMOOTH_FROM)
+    if ends:
+        places = tuple(f"{name} {low:.4g} to {high:.4g}" for low, high in ends)
+        yield Curves(label, values, overlaps=True, places=places)
 
 
 def _ripples(over: str, place: np.ndarray, finest: int) -> Iterator[Curves]:

@@ -23,6 +23,8 @@ from dtprob.models.axes import is_unnamed
 
 _BAND: Final = 6
 """Entries of an axis from which it may be a band, whose mirror frequency an imbalance of I and Q brings in."""
+_MOST_BY_COLUMN: Final = 1 << 10
+"""Curves along an axis up to which each entry of a last axis has its own."""
 type Over = Sequence[tuple[Quantity, Sequence[Curves]]]
 
 
@@ -211,7 +213,7 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
     for i, axis in enumerate(site.axes):
         for found in along(axis, site.value.shape[i]):
             yield Pattern(found.label, (i,), found)
-            if i < last and 1 < site.value.shape[last] <= COLUMNS:
+            if i < last and 1 < site.value.shape[last] <= COLUMNS and found.extent[0] <= _MOST_BY_COLUMN:
                 yield Pattern(f"{found.label} x {site.axes[last]}", (i, last), found)
     for quantity, all_curves in over:
         if (kept := quantity.kept(site.axes, site.value.shape)) is not None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -73,7 +74,7 @@ def _stretches(axes: Sequence[str], shape: Sequence[int]) -> Found:
 
 
 def _courses(along: Along, axes: Sequence[str], shape: Sequence[int]) -> Found:
-    """Along one axis, what the groups of the other do in its course: at each position, and smoothly."""
+    """Along one axis, what the groups of the other do in its course: at each position, in stretches, and smoothly."""
     for own, over in ((0, 1), (1, 0)):
         groups = [found for found in along(axes[own], shape[own]) if found.column is not None]
         for group in groups:
@@ -82,6 +83,10 @@ def _courses(along: Along, axes: Sequence[str], shape: Sequence[int]) -> Found:
                 at = tuple(f"{axes[over]} {k}" for k in range(shape[over]))
                 each = Curves("", sparse.csr_matrix(sparse.identity(shape[over])), places=at)
                 yield (0, 1), _beside(f"{group.label} x {axes[over]}", group, each, is_first=own == 0)
+            for some in stretches(shape[over], axes[over]):
+                if group.extent[0] * some.extent[0] <= _MOST_BLOCKS:
+                    found = _beside(f"{some.label} {group.label}", group, some, is_first=own == 0)
+                    yield (0, 1), replace(found, plain=False, overlaps=True)
             for smooth in along(axes[over], shape[over])[:1]:
                 label = f"{smooth.label} {group.label}"
                 yield (0, 1), _beside(label, group, smooth, is_first=own == 0)

@@ -8,6 +8,7 @@ from typing import Final
 
 import numpy as np
 
+from dtprob.gap.where.curves import Curves
 from dtprob.gap.where.families import Family, Pattern, Site
 from dtprob.gap.where.family_test import FamilyTest
 from dtprob.gap.which.fields import common_spread, spread_terms
@@ -45,17 +46,12 @@ class Suspect:
 
 
 def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
-    """The families of a site that have the most evidence, ripples also narrowed to the half waves that bring it."""
-    whole = [
-        test
-        for test in tests
-        if test.variance.size <= _MOST_WEIGHTS
-        and not _overlaps(test.family.pattern)
-        and test.family.kind != "shape"  # which no parameter that all distributions have moves
-    ]
-    choice = float(np.log(max(len(whole), 1)))
-    found = [_suspect(site, test, choice) for test in whole]
-    found += [_suspect(site, narrow, choice, band) for test in whole for narrow, band in _narrowed(test)]
+    """The families of a site that have the most evidence, those of many bands or places also narrowed to the best."""
+    # no parameter that all distributions have moves their shape
+    moved = [test for test in tests if test.family.kind != "shape" and test.variance.size <= _MOST_WEIGHTS]
+    choice = float(np.log(max(len(moved), 1)))
+    found = [_suspect(site, test, choice) for test in moved if _overlapping(test.family.pattern) is None]
+    found += [_suspect(site, narrow, choice, band) for test in moved for narrow, band in _narrowed(test)]
     return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
 
 
@@ -68,8 +64,8 @@ def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
     """
     pattern, most = surest.family.pattern, _NEARLY * np.log(max(surest.p_value, _FARTHEST))
     alike = [t for t in tests if t.family.kind == surest.family.kind and np.log(t.p_value) <= most]
-    if _overlaps(pattern):
-        few = [t for t in alike if len(t.variance) <= _FEW or _overlaps(t.family.pattern)]
+    if _overlapping(pattern) is not None:
+        few = [t for t in alike if len(t.variance) <= _FEW or _overlapping(t.family.pattern) is not None]
         return max(few, key=_evidence)
     if pattern.kept and not _is_plain(pattern):
         plain = max((t for t in alike if _is_plain(t.family.pattern)), key=_evidence, default=surest)
@@ -79,13 +75,23 @@ def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
 
 def _evidence(test: FamilyTest) -> float:
     """Log Bayes factor of random weights of a family, of the best place alone where its curves overlap."""
-    curves, size = test.family.pattern.curves, len(test.variance)
-    if curves is None or not curves.overlaps:
+    curves = _overlapping(test.family.pattern)
+    if curves is None:
         return common_spread(test.first[0], test.variance)[1]
-    each = size // len(curves.places)
-    places = [slice(start, start + each) for start in range(0, size, each)]
-    best = max(common_spread(test.first[0][place], test.variance[place])[1] for place in places)
-    return best - float(np.log(len(places)))
+    place, chances = _at_best_place(test, curves)
+    return common_spread(place.first[0], place.variance)[1] - chances
+
+
+def _at_best_place(test: FamilyTest, curves: Curves) -> tuple[FamilyTest, float]:
+    """A family of curves that overlap with the one that has most evidence, and the logarithm of how many there are."""
+    count, _ = curves.extent
+    each = len(test.variance) // count
+    own = [slice(start, start + each) for start in range(0, count * each, each)]
+    best = int(np.argmax([common_spread(test.first[0][one], test.variance[one])[1] for one in own]))
+    only = replace(curves, label=curves.places[best], values=curves.values[[best]], overlaps=False, places=())
+    family = replace(test.family, pattern=replace(test.family.pattern, label=only.label, curves=only))
+    place = test._replace(family=family, first=test.first[:, own[best]], variance=test.variance[own[best]])
+    return place, float(np.log(count))
 
 
 def _is_plain(pattern: Pattern) -> bool:
@@ -93,14 +99,19 @@ def _is_plain(pattern: Pattern) -> bool:
     return pattern.curves is not None and pattern.curves.plain
 
 
-def _overlaps(pattern: Pattern) -> bool:
-    """Whether the curves of a pattern tell the same many times over, so that their evidence would be, too."""
-    return pattern.curves is not None and pattern.curves.overlaps
+def _overlapping(pattern: Pattern) -> Curves | None:
+    """A pattern's curves where they tell the same many times over, so that their evidence would be, too."""
+    return pattern.curves if pattern.curves is not None and pattern.curves.overlaps else None
 
 
 def _narrowed(test: FamilyTest) -> Iterator[tuple[FamilyTest, float]]:
-    """The ripple's band of 1, 2, 4 ... half waves with the most evidence, and the logarithm of how many there were."""
+    """Of ripples the band of 1, 2, 4 ... half waves with the most evidence, of curves that overlap the best one.
+
+    Each with the logarithm of how many there were.
+    """
     pattern = test.family.pattern
+    if (curves := _overlapping(pattern)) is not None:
+        yield _at_best_place(test, curves)
     if pattern.curves is None or pattern.curves.ripple is None:
         return
     count, _ = pattern.curves.extent

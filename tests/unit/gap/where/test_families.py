@@ -227,7 +227,7 @@ def test_a_quantity_lies_on_the_axes_along_which_it_varies():
 
 def test_curves_over_a_quantity_are_smooth_in_its_rank_and_ripples_over_its_values():
     values = np.random.default_rng(0).lognormal(size=(LENGTH, 3))
-    smooth, steps, *ripples = quantity("delay", ("link", "path"), values).curves()
+    smooth, steps, between, *ripples = quantity("delay", ("link", "path"), values).curves()
     order = np.argsort(values.reshape(-1))
     assert smooth.label == "along delay"
     assert np.all(np.diff(smooth.values[0][order]) < 0)
@@ -235,6 +235,14 @@ def test_curves_over_a_quantity_are_smooth_in_its_rank_and_ripples_over_its_valu
     assert steps.places[7] == f"beyond {np.median(values):.4g} of delay"
     assert np.all(np.diff(steps.values[:, order]) >= 0)
     np.testing.assert_allclose(steps.values.mean(1), 0.5 - np.arange(1, 16) / 16, atol=1 / values.size)
+    assert between.label == "between two values of delay"
+    low, high = map(float, between.places[70].removeprefix("delay ").split(" to "))
+    inside = between.values[[70]].toarray()[0] > 0
+    assert inside.sum() == pytest.approx(values.size / 16, abs=4)
+    np.testing.assert_array_equal(values.reshape(-1)[inside].min(), pytest.approx(low, rel=1e-3))
+    np.testing.assert_array_equal(values.reshape(-1)[inside].max(), pytest.approx(high, rel=1e-3))
+    outside = values.reshape(-1)[~inside]
+    assert not ((outside > 1.001 * low) & (outside < 0.999 * high)).any()
     scaled = (values.reshape(-1) - values.min()) / np.ptp(values)
     np.testing.assert_allclose(ripples[0].values[1], np.cos(6 * np.pi * scaled), atol=1e-12)
     assert ripples[-1].label.endswith("to 64 half waves")
@@ -310,6 +318,9 @@ def test_what_a_group_does_at_some_hours_is_noticed(turned):
     site = deterministic("load", axes, np.ones(gradients.shape[1:]), gradients)
     found = {f.label: family_test(f, s) for f, s in families(lambda axis, _: along[axis], (), site)}
     each, course = found["additive, by vendor x hour"], found["additive, smooth in hour by vendor"]
+    some = found["additive, stretch of hour by vendor"]
+    assert some.p_value < 1e-6 * min(each.p_value, course.p_value)
+    assert set(some.label.removeprefix("additive, ").split(", ")) == {"vendor 3", "hour 17 to 18"}
     assert each.variance.shape == (200,)
     assert course.variance.shape == (20,)
     assert each.p_value < 1e-2
@@ -381,7 +392,8 @@ def test_a_measured_column_of_few_values_makes_groups_and_no_ripples():
     found = curves(Problem(table, {**rows(), "place": floor}, [bend()], "row"), "row", LENGTH)
     of_floor = [c for c in found if "place" in c.label]
     assert {c.label for c in of_floor} >= {"by place", "along x by place"}
-    assert not any(c.ripple is not None or c.overlaps for c in of_floor)
+    of_its_values = [c for c in of_floor if not c.label.endswith("by place")]
+    assert not any(c.ripple is not None or c.overlaps for c in of_its_values)
 
 
 def test_ripples_are_no_finer_than_the_values_are_many():

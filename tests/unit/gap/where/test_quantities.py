@@ -88,14 +88,18 @@ def test_columns_that_are_broadcast_lie_on_the_observations_axes():
             np.testing.assert_array_equal(got[name], np.broadcast_to(column, seen.shape))
 
 
-def pairs(**columns):
+def curves_of(**columns):
     size = len(next(iter(columns.values())))
     observed = {"y": SimpleNamespace(axes=("row",), shape=(size,))}
     declaration = SimpleNamespace(observed=observed)
     problem = SimpleNamespace(
         data=columns, observed=SimpleNamespace(arguments=frozenset()), declaration=declaration
     )
-    return {found.label: found.values for found in curves(problem, "row", size)}
+    return {found.label: found for found in curves(problem, "row", size)}
+
+
+def pairs(**columns):
+    return {label: found.values for label, found in curves_of(**columns).items()}
 
 
 def test_two_columns_of_whole_numbers_make_cells():
@@ -118,6 +122,24 @@ def test_a_line_along_one_column_may_differ_by_another():
     for b, line in enumerate(lines):
         assert not line[band != b].any()
         assert abs(np.corrcoef(line[band == b], distance[band == b])[0, 1]) == pytest.approx(1.0)
+
+
+def test_a_group_may_differ_between_two_values_of_a_column_or_for_a_while():
+    """As a sector does in the shadow of something, or a receiver while it was broken."""
+    rng = np.random.default_rng(4)
+    band, distance = rng.integers(0, 3, 480), rng.uniform(size=480)
+    found = curves_of(band=band, distance=distance)
+    for label, along in (
+        ("between two values of distance by band", distance),
+        ("stretch of row by band", np.arange(480)),
+    ):
+        some = found[label]
+        assert some.overlaps
+        for words, inside in zip(some.places[::40], some.values.toarray()[::40] > 0, strict=True):
+            group, ends = words.split(", ")
+            low, high = (float(word) for word in ends.split(" ", 1)[1].split(" to "))
+            within = (along >= 0.999 * low) & (along <= 1.001 * high)
+            np.testing.assert_array_equal(inside, within & (band == int(group.removeprefix("band "))))
 
 
 def test_whole_numbers_that_only_rise_are_a_line_too():

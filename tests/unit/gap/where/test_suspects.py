@@ -52,6 +52,18 @@ def test_a_band_of_one_half_wave_is_left_as_it_is(ripples):
     assert [s.family for s in found] == [one]
 
 
+def test_of_places_that_overlap_the_best_one_alone_may_be_what_varies():
+    """One of eight is out by 8; all together would count the same scores many times over."""
+    places = Curves("near a place", np.eye(8), overlaps=True, places=tuple(f"place {i}" for i in range(8)))
+    scores = np.random.default_rng(1).normal(size=(9, 8))
+    scores[0, 5] = 8.0
+    (found,) = suspects(SITE, [FamilyTest(family_of(places), 0.0, np.ones(9), scores, np.ones(8))])
+    assert found.family.label == "additive, place 5"
+    np.testing.assert_array_equal(found.family.pattern.curves.values, np.eye(8)[[5]])
+    assert found.evidence == pytest.approx(0.5 * (64 - 1 - np.log(64)) - np.log(8), abs=1e-6)
+    assert found.price == pytest.approx(np.log(8))
+
+
 def test_what_varies_along_a_column_is_not_named_by_one_of_many_places_that_show_it(ripples):
     """Eight places that overlap are all out by 4, one cosine along a column by 10; together the places are the surest."""
     places = Curves("near a place", np.eye(8), overlaps=True, places=tuple(f"place {i}" for i in range(8)))
