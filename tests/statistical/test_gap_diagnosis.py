@@ -127,7 +127,8 @@ def test_the_verdict_does_not_hang_on_the_key():
     assert {run(line, none, key=k).verdict for k in range(4)} == {"NO_GAP"}
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.study)])
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [0, 1])
 def test_two_effects_are_found_one_after_the_other(seed):
     shift = 0.5 * inputs() ** 2 + 0.5 * np.sin(3 * inputs())
     found = run(line, draw("line", seed=20 + seed, shift=shift), key=seed)
@@ -141,7 +142,8 @@ def test_two_effects_are_found_one_after_the_other(seed):
     assert behind == sorted(behind)
 
 
-@pytest.mark.parametrize("seed", [0, *(pytest.param(seed, marks=pytest.mark.study) for seed in (1, 2))])
+@pytest.mark.study
+@pytest.mark.parametrize("seed", [0, 1, 2])
 def test_an_effect_out_of_the_library_is_not_blamed_on_another(seed):
     others = (saturation(), ripple("ripple9", 9.0))
     shift = 0.8 * np.sin(3 * inputs())
@@ -208,6 +210,7 @@ class Earlier:
         return {"a": 0.7 + noise[0], "b": -1.2 + noise[1]}
 
 
+@pytest.mark.study
 def test_earlier_data_turn_a_change_into_a_gap():
     found = run(line, draw("line", seed=41, shift=0.6), (raised(), bend()), reference=Earlier())
     assert (found.verdict, found.causes[0].effects) == ("LISTED", ("raised",))

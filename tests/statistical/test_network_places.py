@@ -61,5 +61,6 @@ def test_when_a_device_died_is_found(looked, window):
     assert onset == pytest.approx(window / WINDOWS, abs=1.5 / WINDOWS)
 
 
+@pytest.mark.study
 def test_a_device_that_lives_is_not_missed(looked):
     assert looked(WINDOWS)[0] > 0.01

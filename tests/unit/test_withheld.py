@@ -127,6 +127,7 @@ def test_resume_keeps_no_answers_to_another_case(answered, tmp_path, change, mon
     assert report.stat().st_mtime_ns > before
 
 
+@pytest.mark.study
 def test_a_worker_that_dies_ends_no_other_case_and_is_replaced(tmp_path, monkeypatch):
     monkeypatch.setattr(withheld, "_LIFE", 2)
     for name in "abcdef":

@@ -103,7 +103,7 @@ def slope_along(loss, module, seed):
     return float(jax.jit(jax.grad(along))(0.0)), float(compiled(1e-6) - compiled(-1e-6)) / 2e-6
 
 
-@pytest.mark.parametrize("kind", [FramePolicy, HistoryPolicy])
+@pytest.mark.parametrize("kind", [FramePolicy, pytest.param(HistoryPolicy, marks=pytest.mark.study)])
 def test_the_actors_gradient_against_differences(kind):
     policy, memory, trajectory = played(kind)
     advantage = jax.random.normal(KEY, trajectory.logit.shape)

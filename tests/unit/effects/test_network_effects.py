@@ -116,6 +116,7 @@ def test_a_source_in_a_closed_loop_generates_more_after_its_own_delivery_and_onl
     np.testing.assert_allclose(after[..., 1, :], law(data)[..., 1, :], atol=1e-12)  # the other cluster
 
 
+@pytest.mark.study
 def test_a_device_falls_silent_part_of_the_way():
     data = {**records(simulate(40, 0), clusters=CLUSTERS, window=4), "concentration": 1.0}
     offered = {effect.name: effect for effect in catalogue(declare(multi_access, data).sites, data)}

@@ -36,6 +36,7 @@ def test_counts_are_found_from_the_model(arguments, posterior):
         np.testing.assert_allclose(posterior.extra[f"counts.{name}"], counts.sum(axis=0) * free, atol=1e-6)
 
 
+@pytest.mark.study
 def test_draws_have_the_moments_of_the_closed_form(arguments, posterior):
     counts = {name: value.sum(axis=0) for name, value in window_counts(arguments).items()}
     law = DirichletTables(priors(arguments["clusters"], 1.0)).updated(counts)

@@ -50,7 +50,9 @@ def same(first, second):
     )
 
 
-@pytest.mark.parametrize("name", ["smc", "ensemble", pytest.param("bagging", marks=pytest.mark.study)])
+@pytest.mark.parametrize(
+    "name", ["ensemble", *(pytest.param(name, marks=pytest.mark.study) for name in ("smc", "bagging"))]
+)
 def test_an_interrupted_run_continues_as_if_nothing_had_happened(name, tmp_path, monkeypatch):
     engine, data = ENGINES[name], at_the_cut_data()
     whole = engine(KEY, at_the_cut, data)

@@ -61,6 +61,7 @@ def test_chunks_chains_and_draws_do_not_change_a_draw(engine):
             np.testing.assert_array_equal(other.draws[name][:, :shared], values[:, :shared])
 
 
+@pytest.mark.study
 def test_side_by_side_is_the_same_up_to_rounding_at_first():
     data = normal_data()
     apart = NUTS(warmup=0, draws=5, chains=3)(KEY, normal, data)

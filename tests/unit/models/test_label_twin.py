@@ -162,6 +162,7 @@ def test_regions_of_few_values_or_skewed_features_are_whole():
         assert np.max(moved) == pytest.approx(1.0, abs=0.01)
 
 
+@pytest.mark.study
 def test_a_predictor_without_bias_has_no_gap():
     data = rows(seed=5)
     effects = catalogue(declare(label_twin, data).sites, data)

@@ -100,6 +100,7 @@ def content(folder: Path) -> dict[str, bytes]:
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*")) if p.is_file()}
 
 
+@pytest.mark.study
 @pytest.mark.libllvm
 def test_the_same_seed_makes_the_same_bytes_and_resumes(tmp_path):
     def make(name: str, **changes):

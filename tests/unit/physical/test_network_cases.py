@@ -155,6 +155,7 @@ def test_an_outage_is_remembered_beside_other_faults(family):
     np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.study
 def test_cases(tmp_path):
     for name in ("first", "second"):
         TRACK.generate(tmp_path / name, 4, 3, lambda_=100.0)

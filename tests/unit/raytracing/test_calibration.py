@@ -202,6 +202,7 @@ def power_error(paths, found):
     return float(jnp.max(jnp.abs(power(found.permittivity, found.conductivity) / truth - 1)))
 
 
+@pytest.mark.study
 def test_aware_scheme_finds_the_material_where_the_oblivious_one_cannot(paths, uniform_runs):
     runs, power = uniform_runs
     error = {}
@@ -311,6 +312,7 @@ def test_concentration_in_single_precision(kappa):
     assert float(found) == pytest.approx(kappa, rel=max(2e-3, 1e-4 * kappa))
 
 
+@pytest.mark.study
 def test_a_link_without_signal_spoils_no_calibration(paths, array):
     tones = jnp.linspace(-50e6, 50e6, 8)
     gain = path_gain(paths, paths.permittivity, paths.conductivity, law="half_space")

@@ -67,6 +67,7 @@ def test_what_does_not_fit_is_said():
         searched(700_000, max_paths=1_000_000)
 
 
+@pytest.mark.study
 @pytest.mark.libllvm
 def test_a_small_table_loses_paths_and_the_large_one_none(rt, many, monkeypatch):
     """The defect is there: without it, drop the larger table."""

@@ -151,6 +151,7 @@ def test_a_resumed_loop_is_the_same_to_the_last_bit(case, runs):
     assert np.array_equal(whole.policy, part.policy)
 
 
+@pytest.mark.study
 def test_the_history_says_what_was_done_and_why(case, runs):
     entries = history(case, runs[0])["entries"]
     once = ["collect", "learn", "control", "hand_over", "monitor"]

@@ -132,6 +132,7 @@ def test_what_is_drawn_in_units_of_another(twin, expected, data):
     assert len(held(problem)) == sum(size.get(name, 1) for name in shared)
 
 
+@pytest.mark.study
 def test_readings_that_are_left_out_are_judged_by_all_that_is_not_known_of_states():
     """A walk of 120 steps, of which every third reading is left out: its density is that of Kriging."""
     rng = np.random.default_rng(2)

@@ -89,6 +89,7 @@ def test_the_size_of_noise_beside_levels_of_many_devices(factor):
     assert index in found.volume.index
 
 
+@pytest.mark.study
 def test_differences_are_taken_within_what_the_data_leave_open():
     """Sixty levels tell their middle to .2: a tenth of its prior, .5, would leave where the expansion holds."""
     start = based(Problem(levels, readings(3, 1.0), [], "device"), jax.random.key(0))

@@ -140,9 +140,8 @@ def found(kind, loss, seed):
     )
 
 
-@pytest.mark.parametrize(
-    "kind", [pytest.param(kind, marks=pytest.mark.study) if kind != "turned" else kind for kind in OBSERVED]
-)
+@pytest.mark.study
+@pytest.mark.parametrize("kind", OBSERVED)
 def test_a_wall_is_named_and_its_loss_is_right(kind):
     said = found(kind, 2.0, seed=6)
     assert said.verdict == "LISTED"

@@ -98,6 +98,7 @@ def test_rows_of_a_mixture_of_two_families():
     assert abs(replicate.mean() - value.mean()) < 4.5 * value.std() * np.sqrt(2 / 4000)
 
 
+@pytest.mark.study
 def test_a_mixture_that_is_known_is_the_same_without_quadratures_of_its_own(monkeypatch):
     parts = dist.Normal(jnp.stack([jnp.zeros(50), spread_out(1.0, 4.0, 50)], -1), jnp.asarray([1.0, 2.0]))
     fn = dist.MixtureSameFamily(dist.Categorical(jnp.asarray([0.7, 0.3])), parts)
@@ -152,9 +153,8 @@ EFFECTS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("loss", "verdict"), [pytest.param(0.0, "NO_GAP", marks=pytest.mark.study), (0.4, "LISTED")]
-)
+@pytest.mark.study
+@pytest.mark.parametrize(("loss", "verdict"), [(0.0, "NO_GAP"), (0.4, "LISTED")])
 def test_a_diagnosis_of_envelopes(loss, verdict):
     rng = np.random.default_rng(4)
     hour, distance = np.repeat(np.arange(12), 40), rng.uniform(1.0, 3.0, 480)

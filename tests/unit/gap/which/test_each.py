@@ -88,6 +88,7 @@ def refitted(problem, base, found):
     return refit(wider, before, EACH, [start]).x[index]
 
 
+@pytest.mark.study
 def test_one_misplaced_receiver_is_found_and_no_other_is_moved():
     moved = np.zeros((14, 2))
     moved[5] = 0.13, -0.21

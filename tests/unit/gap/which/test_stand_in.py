@@ -50,6 +50,7 @@ def test_an_effect_beside_unknown_levels_is_kept():
     assert said.to_report()["remainder"] is None
 
 
+@pytest.mark.study
 def test_an_effect_that_takes_up_a_part_of_unknown_levels_is_not():
     """Two access points of eight are as far off as the effect says, others are, too."""
     levels = 2.0 * np.array([1.0, 1.0, -1.0, -1.0, 1.5, -1.5, 0.8, -0.8])

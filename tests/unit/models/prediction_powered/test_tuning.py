@@ -34,6 +34,7 @@ def test_lambda_stays_within_its_bounds(quality):
     assert found.value.max() <= 1
 
 
+@pytest.mark.study
 def test_lambda_tells_good_predictors_from_bad_ones():
     perfect, useless = (lambdas(quality, Practice()) for quality in ("perfect", "useless"))
     np.testing.assert_allclose(perfect.raw.mean(), 1 / (1 + 60 / 500), rtol=0.01)
