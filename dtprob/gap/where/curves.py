@@ -112,19 +112,19 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     yield from _ripples(axis, place, _FINEST)
     found = columns(problem, axis, size)
     made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}
-    by = {n: _by(n, index, found[n]) for n, index in made.items()}
+    by = {n: by_group(n, index, found[n]) for n, index in made.items()}
     for name, column in found.items():
         if _is_ordered(column):
             yield from over_column(name, column, _FINEST if len(found) <= _FEW else _COARSE)
         if name in by:
             yield by[name]
-    yield from _pairs(found, by, size)
+    yield from _pairs(found, by)
     yield from itertools.islice(_cells(found, made), MOST_PAIRS)
     for group in itertools.islice(by.values(), 0 if axis in found else MOST_PAIRS):
         yield from _in_groups(group, *_between(f"stretch of {axis}", axis, np.arange(size)))
 
 
-def _by(name: str, index: np.ndarray, column: np.ndarray) -> Curves:
+def by_group(name: str, index: np.ndarray, column: np.ndarray) -> Curves:
     """By the groups (size,) that a column makes of positions."""
     places = groups_in_words(index, {name: column})
     return Curves(f"by {name}", grouped(index), column=name, plain=True, places=places)
@@ -150,26 +150,35 @@ def _makes_groups(column: np.ndarray) -> bool:
     return not _is_ordered(column) or (count <= GROUPS and _SHARED * count <= len(column))
 
 
-def _pairs(found: Mapping[str, np.ndarray], by: Mapping[str, Curves], size: int) -> Iterator[Curves]:
+def _pairs(found: Mapping[str, np.ndarray], by: Mapping[str, Curves]) -> Iterator[Curves]:
     """What varies with two columns (size,) together: smooth over both, along one in each group of the other.
 
     Args:
         found: the columns.
         by: groups of those that make some.
-        size: positions.
     """
     smooth = [n for n, c in found.items() if _is_ordered(c) and np.issubdtype(c.dtype, np.floating)]
     for one, other in list(itertools.combinations(smooth, 2))[:MOST_PAIRS]:
-        first, second = (_waves(_rank(found[name]), 1, _CROSSED) for name in (one, other))
-        products = first[:, None] * second[None]
-        yield Curves(f"over {one} and {other}", products.reshape(-1, size))
-        yield _neighbourhoods((one, other), np.stack([found[one], found[other]], axis=1).astype(float))
+        yield from over_both((one, other), np.stack([found[one], found[other]], axis=1))
     for along in (smooth, [n for n, c in found.items() if _is_rising(c)]):
         crossed = [(one, other) for one, other in itertools.product(along, by) if one != other]
         for one, other in crossed[:MOST_PAIRS]:
-            lines = sparse.csr_matrix(by[other].values).multiply(_line(found[one])).tocsr()
-            yield replace(by[other], label=f"along {one} by {other}", column=None, values=lines)
-            yield from _in_groups(by[other], *_between(f"between two values of {one}", one, found[one]))
+            yield from along_in_groups(by[other], one, found[one])
+
+
+def over_both(names: tuple[str, str], place: np.ndarray) -> Iterator[Curves]:
+    """What varies over the plane of two columns (size, 2): smoothly, and near a place."""
+    first, second = (_waves(_rank(column), 1, _CROSSED) for column in place.T)
+    products = first[:, None] * second[None]
+    yield Curves(f"over {names[0]} and {names[1]}", products.reshape(-1, len(place)))
+    yield _neighbourhoods(names, place.astype(float))
+
+
+def along_in_groups(group: Curves, name: str, column: np.ndarray) -> Iterator[Curves]:
+    """What varies with a column (size,) in each group: along it, and between two of its values."""
+    lines = sparse.csr_matrix(group.values).multiply(_line(column)).tocsr()
+    yield replace(group, label=f"along {name} {group.label}", column=None, values=lines)
+    yield from _in_groups(group, *_between(f"between two values of {name}", name, column))
 
 
 def _in_groups(group: Curves, *some: Curves) -> Iterator[Curves]:

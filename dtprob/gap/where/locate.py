@@ -32,7 +32,7 @@ from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.foremost import foremost
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.moments import further_moments
-from dtprob.gap.where.quantities import Quantity, cells, groups, quantity
+from dtprob.gap.where.quantities import Quantity, cells, groups, quantity, together
 from dtprob.gap.where.site_finding import SURE, SiteFinding, rank, shadows_last
 from dtprob.gap.where.suspects import Suspect, plainest, suspects
 
@@ -161,6 +161,11 @@ def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
     knowing = conditioned(problem, x)
     apart = {n: value for n, value in values.items() if n not in knowing}
     over = [(q, tuple(q.curves())) for q in _quantities(problem, apart)]
+    over += [
+        (q, (found,))
+        for axes, shape, given in _observed(problem)
+        for q, found in together(axes, shape, given)
+    ]
     discrete = any(is_discrete(family) for family in problem.families.values())
     return _Ways(values, along, over, normal_like(drawn) if discrete else None)
 
@@ -208,10 +213,16 @@ def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[
             yield found
     for name, (axes, value) in columns.items():
         yield from groups(name, axes, value)
+    for axes, shape, given in _observed(problem):
+        yield from cells(axes, shape, given)
+
+
+def _observed(problem: Problem) -> Iterator[tuple[tuple[str, ...], tuple[int, ...], dict[str, np.ndarray]]]:
+    """Axes and shape of what is observed along several axes, each once, with the columns of the data there."""
     seen = {(site.axes, site.shape): site for site in problem.declaration.observed.values()}
     for (axes, shape), site in seen.items():
         if len(shape) > 1:
-            yield from cells(axes, shape, all_columns(problem, site))
+            yield axes, shape, all_columns(problem, site)
 
 
 def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -15,9 +15,12 @@ from dtprob.gap.where.curves import (
     ORDER,
     SMOOTH_FROM,
     Curves,
+    along_in_groups,
+    by_group,
     grouped,
     groups_in_words,
     joined,
+    over_both,
     over_column,
 )
 from dtprob.models.axes import is_unnamed
@@ -120,6 +123,41 @@ def cells(
         if index is not None:
             whole = np.broadcast_to(index, shape)
             yield Quantity(f"{one} and {other}", tuple(axes), whole, ordered=False, coded=True)
+
+
+def together(
+    axes: Sequence[str], shape: tuple[int, ...], columns: Mapping[str, np.ndarray]
+) -> Iterator[tuple[Quantity, Curves]]:
+    """What two columns tell together: between two values of one in a group of the other, or near a place of both.
+
+    As what a band does near a station. Not for two along the same single axis, which `curves` of that axis holds.
+
+    Args:
+        axes: of an observed site.
+        shape: of the site.
+        columns: of the data, of as many axes, of size 1 along those that a column does not lie on.
+    """
+    if ORDER * np.prod(shape) > _LARGEST:
+        return
+    wide = {name: _varies(column) for name, column in columns.items()}
+    flat = {name: np.broadcast_to(column, shape).reshape(-1) for name, column in columns.items()}
+    made = {name: np.unique(column, return_inverse=True)[1] for name, column in flat.items()}
+    few = [name for name, index in made.items() if 1 <= index.max() < GROUPS]
+    real = [n for n, index in made.items() if columns[n].dtype.kind == "f" and index.max() >= SMOOTH_FROM]
+
+    def apart(pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
+        return [(a, b) for a, b in pairs if a != b and (wide[a] != wide[b] or len(wide[a]) > 1)][:MOST_PAIRS]
+
+    def whole(one: str, other: str) -> Quantity:
+        values = made[one].reshape(shape)
+        return Quantity(f"{one} and {other}", tuple(axes), values, ordered=False, coded=True)
+
+    for one, other in apart(itertools.product(few, real)):
+        group = by_group(one, made[one], flat[one])
+        yield from ((whole(one, other), found) for found in along_in_groups(group, other, flat[other]))
+    for one, other in apart(itertools.combinations(real, 2)):
+        place = np.stack([flat[one], flat[other]], axis=1)
+        yield from ((whole(one, other), found) for found in over_both((one, other), place))
 
 
 def _varies(values: np.ndarray) -> tuple[int, ...]:

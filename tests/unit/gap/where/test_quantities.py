@@ -8,7 +8,7 @@ from scipy import sparse
 
 from dtprob.gap.where.curves import curves
 from dtprob.gap.where.data_columns import all_columns, whole_columns
-from dtprob.gap.where.quantities import cells, groups, quantity
+from dtprob.gap.where.quantities import cells, groups, quantity, together
 
 
 @pytest.fixture
@@ -190,3 +190,32 @@ def test_columns_on_different_axes_make_cells_too():
             assert len({*zip(here[cell], there[cell], strict=True)}) == 1
     within = {"channel": given["channel"], "low": given["channel"] < 2}
     assert not list(cells(site.axes, site.shape, within))
+
+
+def test_a_band_may_differ_near_a_station_on_several_axes_too():
+    rng = np.random.default_rng(7)
+    band, distance = rng.integers(0, 3, (20, 24)), rng.uniform(30.0, 400.0, (20, 24))
+    found = {
+        f.label: (q, f)
+        for q, f in together(("segment", "reading"), (20, 24), {"band": band, "distance": distance})
+    }
+    assert set(found) == {"along distance by band", "between two values of distance by band"}
+    whole, some = found["between two values of distance by band"]
+    assert whole.kept(("segment", "reading"), (20, 24)) == (0, 1)
+    near = some.places.index(
+        next(p for p in some.places if p.startswith(f"band 1, distance {distance.min():.4g} "))
+    )
+    inside = some.values[[near]].toarray().reshape(20, 24) > 0
+    np.testing.assert_array_equal(inside, (band == 1) & (distance <= distance[inside].max()))
+
+
+def test_columns_on_different_axes_are_looked_over_together_and_those_of_one_are_not_again():
+    rng = np.random.default_rng(8)
+    battery, heat, age = rng.uniform(size=(12, 1)), rng.uniform(size=(1, 30)), rng.uniform(size=(12, 1))
+    given = {"battery": battery, "heat": heat, "age": age}
+    found = {f.label: f for _, f in together(("node", "hour"), (12, 30), given)}
+    assert {"over battery and heat", "over heat and age"} <= set(found)
+    assert "over battery and age" not in found
+    product = np.cos(np.pi * (np.argsort(np.argsort(battery[:, 0])) + 0.5) / 12)[:, None]
+    product = product * np.cos(np.pi * (np.argsort(np.argsort(heat[0])) + 0.5) / 30)
+    assert np.abs(np.corrcoef(product.reshape(-1), found["over battery and heat"].values[0])[0, 1]) > 0.999
