@@ -16,7 +16,7 @@ from dtprob.gap.fitting.columns import rows_of_each, scores_of_each
 
 _FAINT: Final = 1e-6
 """Share of the largest curvature, each unknown in units of its own, below which what moves together moves nothing."""
-MOST: Final = 128
+MOST: Final = 1024
 """Own unknowns of a cluster up to which scores are centred."""
 
 

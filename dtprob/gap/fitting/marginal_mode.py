@@ -21,7 +21,7 @@ from dtprob.gap.fitting.fit import Fit, fit
 from dtprob.gap.fitting.marginal import following, own_mode
 from dtprob.gap.fitting.newton import System
 from dtprob.gap.fitting.plausible import nulls, scales, sides
-from dtprob.gap.fitting.states import held, states, states_mode
+from dtprob.gap.fitting.states import held, states, states_following, states_mode
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.volume import Volume
 
@@ -40,7 +40,9 @@ _NARROW: Final = 0.5
 _DENSE: Final = 12
 """Shared coordinates up to which second differences between two of them are taken too."""
 _SLIGHT: Final = 0.01
-"""Nats by which the volume bends along a coordinate, over its posterior, below which it is not looked at with others."""
+_FLAT: Final = 1e-4
+"""Nats by which the volume bends along a coordinate, over its posterior, below which it is not looked at with others; and
+beside states those by which it changes over a step."""
 _EXACT: Final = 1e-7
 _FAITHFUL: Final = 0.5
 """Nats that the expansion may be off at a fit."""
@@ -174,25 +176,37 @@ class _Volumes:
     """
 
     def __init__(self, problem: Problem, x: np.ndarray, free: Around) -> None:
-        self._problem, self._index = problem, free.index
-        self._x, self.here = _inner(problem, x, _EXACT)
-        self._own = activate(problem).local_index
-        bare = problem.with_volume(None)
-        self._follow = None if states(bare).blocks else following(bare, self._x, free.effects, free.index)
+        self._problem = problem
+        there, self.here = _inner(problem, x, _EXACT)
+        self._follow = _following(problem.with_volume(None), there, free)
 
     def __call__(self, move: Float[np.ndarray, " shared"]) -> Float[np.ndarray, " cluster"]:
-        moved = self._x.copy()
-        moved[self._index] += move
-        if self._follow is None:
-            return _inner(self._problem, moved, _EXACT)[1]
-        system, along = self._follow
-        moved[self._own] += along @ move
-        return _inner(self._problem, moved, _EXACT, near=system)[1]
+        there, near = self._follow(move)
+        return _inner(self._problem, there, _EXACT, near=near)[1]
 
     def beside(self, step: Float[np.ndarray, " shared"]) -> tuple[np.ndarray, np.ndarray]:
         """V_c (cluster, shared) a step up and a step down each coordinate."""
         up, down = (np.stack([self(sign * unit) for unit in np.diag(step)], axis=1) for sign in (1.0, -1.0))
         return up, down
+
+
+def _following(
+    problem: Problem, x: np.ndarray, free: Around
+) -> Callable[[np.ndarray], tuple[np.ndarray, System | None]]:
+    """Where a move of the fitted coordinates leads, what is integrated out following; clusters' own system if alone."""
+    if states(problem).blocks:
+        whole = states_following(problem, x, free.index)
+        return lambda move: (x + whole @ move, None)
+    system, along = following(problem, x, free.effects, free.index)
+    own = activate(problem).local_index
+
+    def moved(move: np.ndarray) -> tuple[np.ndarray, System | None]:
+        there = x.copy()
+        there[free.index] += move
+        there[own] += along @ move
+        return there, system
+
+    return moved
 
 
 def steps(free: Around, joint: Fit) -> Float[np.ndarray, " shared"]:
@@ -224,8 +238,8 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
     middle, (up, down) = volumes.here, volumes.beside(step)
     slope = (up - down) / 2
     bend = (up + down - 2 * middle[:, None])[:, :, None] * np.eye(n)
-    straight = np.abs(np.nan_to_num(up + down - 2 * middle[:, None], posinf=0.0, neginf=0.0)).sum(axis=0)
-    for i, j in combinations(_bent(problem, joint, free, straight / step**2) if n <= _DENSE else (), 2):
+    ways = (up - middle[:, None], down - middle[:, None])
+    for i, j in combinations(_bent(problem, joint, free, step, ways) if n <= _DENSE else (), 2):
         both = sum(volumes(sign * (units[i] + units[j])) for sign in (1.0, -1.0))
         bend[:, i, j] = bend[:, j, i] = both / 2 - middle - (bend[:, i, i] + bend[:, j, j]) / 2
     value, slope, bend = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (middle, slope, bend))
@@ -234,8 +248,10 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
     return Volume(free.index, at[free.index], value, slope / step, bend / np.outer(step, step))
 
 
-def _bent(problem: Problem, joint: Fit, free: Around, bend: np.ndarray) -> list[int]:
-    """The fitted coordinates along which the volume bends enough to matter; all of them beside states.
+def _bent(
+    problem: Problem, joint: Fit, free: Around, step: np.ndarray, ways: tuple[np.ndarray, np.ndarray]
+) -> list[int]:
+    """The fitted coordinates along which the volume bends enough to matter; beside states all that change it at all.
 
     Two that bend by a and b nats over their posteriors bend together by no more than the root of a b, where the volume
     bends one way in all directions.
@@ -244,9 +260,14 @@ def _bent(problem: Problem, joint: Fit, free: Around, bend: np.ndarray) -> list[
         problem: whose volume it is.
         joint: a fit with what is integrated out.
         free: what is fitted.
-        bend: size of the second derivative along each coordinate (shared,), over all clusters.
+        step: along each coordinate (shared,).
+        ways: how much V_c (cluster, shared) changes a step up and a step down.
     """
-    if len(free.index) < 2 or states(problem).blocks:
-        return list(range(len(free.index)))
+    if len(free.index) < 2:
+        return []
+    up, down = (np.nan_to_num(way, posinf=0.0, neginf=0.0) for way in ways)
+    if states(problem).blocks:
+        return [int(i) for i in np.flatnonzero((np.abs(up) + np.abs(down)).sum(axis=0) > _FLAT)]
     place = np.searchsorted(joint.global_index, free.index)
+    bend = np.abs(up + down).sum(axis=0) / step**2
     return [int(i) for i in np.flatnonzero(bend * np.diag(joint.covariance)[place] > _SLIGHT)]

@@ -249,4 +249,4 @@ def _centred(
     if wanted and np.isfinite(w).all():
         centre = Centred.of(there, w_local, w[..., n:])
         return centre.columns(w_global, w[..., :n]), centre
-    return w_global if problem.volume is None else w[..., :n], None
+    return w_global, None

@@ -58,6 +58,33 @@ def held(problem: Problem) -> Int[np.ndarray, " shared"]:
     return np.setdiff1d(activate(problem).global_index, states(problem).global_index)
 
 
+def states_following(
+    problem: Problem, x: np.ndarray, index: Int[np.ndarray, " shared"]
+) -> Float[np.ndarray, "dimension shared"]:
+    """How the mode of states, and of what clusters have of their own beside them, moves with other shared coordinates.
+
+    Args:
+        problem: the model on its data.
+        x: the point, states at their mode.
+        index: positions of the other shared coordinates, of the model or of effects.
+    """
+    active = states(problem)
+    along = np.zeros((len(index), problem.dimension))
+    along[np.arange(len(index)), index] = 1.0
+    pulled = problem.compiled.curvature(x, np.ones(problem.n_cluster), along)
+    system = system_at(problem, active, x)
+    local, schur = system.eliminated()
+    shared, own = -pulled[:, active.global_index].T, -np.moveaxis(pulled[:, active.local_index], 0, -1)
+    if own.shape[1]:
+        shared = shared - np.einsum("csl,clk->sk", system.cross, np.linalg.solve(local, own))
+    shared = np.linalg.solve(schur, shared)
+    along[:, active.global_index] = shared.T
+    if own.shape[1]:
+        own = np.linalg.solve(local, own - np.swapaxes(system.cross, 1, 2) @ shared)
+        along[:, active.local_index] = np.moveaxis(own, -1, 0)
+    return np.nan_to_num(along, posinf=0.0, neginf=0.0).T
+
+
 def states_mode(
     problem: Problem, active: Active, x: np.ndarray, *, steps: int = 20, tolerance: float = 1e-3
 ) -> tuple[Float[np.ndarray, " dimension"], Float[np.ndarray, " cluster"]]:

@@ -42,6 +42,9 @@ def in_order(along: Along, axes: Sequence[str], shape: Sequence[int]) -> Found:
     yield from _stretches(axes, shape)
     if len(shape) == 2 and np.prod(shape) <= _MOST_OF_EACH:
         yield from _courses(along, axes, shape)
+        for found in along(axes[1], shape[1]) if 1 < shape[0] <= COLUMNS else ():
+            if found.extent[0] * shape[0] <= _MOST_BLOCKS:
+                yield (0, 1), _of_each(found, axes[0], shape[0])
 
 
 def _cycles(axes: Sequence[str], shape: Sequence[int]) -> Found:
@@ -58,7 +61,13 @@ def _cycles(axes: Sequence[str], shape: Sequence[int]) -> Found:
 
 
 def _stretches(axes: Sequence[str], shape: Sequence[int]) -> Found:
-    """Stretches of the last axis of what lies along one or two, those of each position and each stretch of the first."""
+    """Stretches of an axis of several, all else alike or by the last; of the last of two also by positions of the first."""
+    last = len(shape) - 1
+    for i, axis in enumerate(axes) if last > 0 else ():
+        for found in stretches(shape[i], axis):
+            yield (i,), found
+            if i < last and 1 < shape[last] <= COLUMNS and found.extent[0] * shape[last] <= _MOST_BLOCKS:
+                yield (i, last), replace(found, label=f"{found.label} x {axes[last]}")
     if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_EACH:
         return
     for found in stretches(shape[-1], axes[-1]):
@@ -106,5 +115,6 @@ def _pairs(first: Curves, second: Curves) -> tuple[str, ...]:
 
 def _of_each(curves: Curves, axis: str, size: int) -> Curves:
     """Curves along the last of a site's two axes, each position of the first with weights of its own."""
-    each = sparse.kron(sparse.identity(size), curves.values)
-    return Curves(f"{curves.label} x {axis}", sparse.csr_matrix(each))
+    each = sparse.csr_matrix(sparse.kron(sparse.identity(size), curves.values))
+    places = tuple(f"{axis} {i}, {place}" for i in range(size) for place in curves.places)
+    return Curves(f"{curves.label} x {axis}", each, overlaps=curves.overlaps, places=places)

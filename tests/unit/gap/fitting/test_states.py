@@ -14,7 +14,7 @@ from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting.bootstrap import observed_rows
 from dtprob.gap.fitting.integrated import based
 from dtprob.gap.fitting.projection import project
-from dtprob.gap.fitting.states import held, states
+from dtprob.gap.fitting.states import held, states, states_following, states_mode
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
@@ -128,6 +128,21 @@ def test_score_and_information_are_those_of_the_marginal_density(fitted):
     assert (tangent * projection.adjoint(raw[None])[0]).sum() == pytest.approx(score, rel=2e-3)
     found, _ = projection.information(tangent[..., None])
     assert found[0, 0] == pytest.approx(information, rel=2e-3)
+
+
+def test_states_follow_what_is_fitted(fitted):
+    """As their mode does, found again a small step away."""
+    _, problem, fit = fitted
+    bare = problem.with_volume(None)
+    free = held(bare)
+    x, _ = states_mode(bare, states(bare), fit.x, tolerance=1e-12)
+    along = states_following(bare, x, free)
+    for i, unit in enumerate(np.eye(len(free))):
+        up, down = (x.copy() for _ in range(2))
+        up[free] += 0.03 * unit
+        down[free] -= 0.03 * unit
+        apart = np.subtract(*(states_mode(bare, states(bare), at, tolerance=1e-14)[0] for at in (up, down)))
+        np.testing.assert_allclose(along[:, i], apart / 0.06, atol=2e-3)
 
 
 def test_squares_lose_their_leverage(fitted):

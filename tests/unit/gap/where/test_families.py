@@ -335,6 +335,39 @@ def test_what_a_group_does_at_some_hours_is_noticed(turned):
     assert step[3, 17:21].mean() > 0.5
 
 
+def test_each_of_a_few_clusters_may_follow_a_column_of_the_other_axis_in_its_own_way():
+    """One cell of six is off in the first hours of each day, by two standard deviations; no other is."""
+    rng = np.random.default_rng(12)
+    hour = np.arange(120) % 24
+    gradients = rng.normal(size=(200, 6, 120))
+    gradients[0, 4] -= 2.0 * (hour < 5)
+    words = tuple(f"hour {h}" for h in range(24))
+    by = Curves("by hour", grouped(hour), column="hour", plain=True, places=words)
+    site = deterministic("load", ("cell", "time"), np.ones((6, 120)), gradients)
+    along = {"cell": (), "time": (by,)}
+    found = {f.label: family_test(f, s) for f, s in families(lambda axis, _: along[axis], (), site)}
+    own = found["additive, by hour x cell"]
+    assert own.p_value < 1e-3 < found["additive, by hour"].p_value
+    places = own.family.pattern.curves.places
+    assert places[int(own.told.argmax())].startswith("cell 4, hour ")
+
+
+def test_a_while_of_one_entry_of_a_third_axis_is_noticed():
+    """One sensor of three, in twelve tracks, from the 20th of 50 steps to the 34th."""
+    rng = np.random.default_rng(13)
+    gradients = rng.normal(size=(200, 12, 50, 3))
+    gradients[0, :, 20:35, 2] += 0.6
+    site = deterministic("mean", ("track", "time", "sensor"), np.ones((12, 50, 3)), gradients)
+    found = {f.label: family_test(f, s) for f, s in families(lambda *_: (), (), site)}
+    some = found["additive, stretch of time x sensor"]
+    assert some.p_value < 1e-6 < found["additive, time x sensor"].p_value
+    together = gradients.copy()
+    together[0, :, 20:35, :2] += 0.6
+    site = deterministic("mean", ("track", "time", "sensor"), np.ones((12, 50, 3)), together)
+    found = {f.label: family_test(f, s) for f, s in families(lambda *_: (), (), site)}
+    assert found["additive, stretch of time"].p_value < 1e-12
+
+
 def test_what_whole_numbers_tell_apart_is_told_of_each_outcome(problem):
     """What a device did last tilts the odds between its outcomes, which sum to nothing over them."""
     rng = np.random.default_rng(5)
