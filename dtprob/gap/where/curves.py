@@ -32,6 +32,8 @@ _CENTRES: Final = 64
 _NEAREST: Final = (1 / 32, 1 / 16, 1 / 8, 1 / 4)
 """Places in the plane of two columns about which a compact region is looked for, and shares of the positions in one."""
 MOST_PAIRS: Final = 6
+_MOST_PLANES: Final = 66
+"""Pairs of columns that are looked at, and those of which no more than what is smooth over both is."""
 GROUPS: Final = 32
 _MOST_WINDOWS: Final = 1 << 13
 """Windows in groups that are looked at."""
@@ -158,8 +160,9 @@ def _pairs(found: Mapping[str, np.ndarray], by: Mapping[str, Curves]) -> Iterato
         by: groups of those that make some.
     """
     smooth = [n for n, c in found.items() if _is_ordered(c) and np.issubdtype(c.dtype, np.floating)]
-    for one, other in list(itertools.combinations(smooth, 2))[:MOST_PAIRS]:
-        yield from over_both((one, other), np.stack([found[one], found[other]], axis=1))
+    for i, (one, other) in enumerate(list(itertools.combinations(smooth, 2))[:_MOST_PLANES]):
+        place = np.stack([found[one], found[other]], axis=1)
+        yield from over_both((one, other), place) if i < MOST_PAIRS else [_over_plane((one, other), place)]
     for along in (smooth, [n for n, c in found.items() if _is_rising(c)]):
         crossed = [(one, other) for one, other in itertools.product(along, by) if one != other]
         for one, other in crossed[:MOST_PAIRS]:
@@ -168,10 +171,15 @@ def _pairs(found: Mapping[str, np.ndarray], by: Mapping[str, Curves]) -> Iterato
 
 def over_both(names: tuple[str, str], place: np.ndarray) -> Iterator[Curves]:
     """What varies over the plane of two columns (size, 2): smoothly, and near a place."""
+    yield _over_plane(names, place)
+    yield _neighbourhoods(names, place.astype(float))
+
+
+def _over_plane(names: tuple[str, str], place: np.ndarray) -> Curves:
+    """Products of smooth curves along each of two columns (size, 2)."""
     first, second = (_waves(_rank(column), 1, _CROSSED) for column in place.T)
     products = first[:, None] * second[None]
-    yield Curves(f"over {names[0]} and {names[1]}", products.reshape(-1, len(place)))
-    yield _neighbourhoods(names, place.astype(float))
+    return Curves(f"over {names[0]} and {names[1]}", products.reshape(-1, len(place)))
 
 
 def along_in_groups(group: Curves, name: str, column: np.ndarray) -> Iterator[Curves]:

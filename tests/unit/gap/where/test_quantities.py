@@ -124,6 +124,14 @@ def test_a_line_along_one_column_may_differ_by_another():
         assert abs(np.corrcoef(line[band == b], distance[band == b])[0, 1]) == pytest.approx(1.0)
 
 
+def test_every_two_of_a_dozen_columns_are_looked_over_together():
+    """What two features of a regression do together is the commonest term that one lacks; compact places are of a few."""
+    rng = np.random.default_rng(9)
+    found = curves_of(**{f"f{i}": rng.normal(size=400) for i in range(12)})
+    assert sum(label.startswith("over ") for label in found) == 66
+    assert sum(label.startswith("near a place") for label in found) == 6
+
+
 def test_a_group_may_differ_between_two_values_of_a_column_or_for_a_while():
     """As a sector does in the shadow of something, or a receiver while it was broken."""
     rng = np.random.default_rng(4)
