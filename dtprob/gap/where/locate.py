@@ -23,8 +23,8 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
+from dtprob.gap.where.along import curves
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
-from dtprob.gap.where.curves import curves
 from dtprob.gap.where.data_columns import all_columns, whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted

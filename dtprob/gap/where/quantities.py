@@ -9,18 +9,15 @@ from typing import Final
 
 import numpy as np
 
+from dtprob.gap.where.crossed import MOST_PAIRS, along_in_groups, joined, over_both
 from dtprob.gap.where.curves import (
     GROUPS,
-    MOST_PAIRS,
     ORDER,
     SMOOTH_FROM,
     Curves,
-    along_in_groups,
     by_group,
     grouped,
     groups_in_words,
-    joined,
-    over_both,
     over_column,
 )
 from dtprob.models.axes import is_unnamed

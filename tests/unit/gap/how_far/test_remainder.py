@@ -19,7 +19,7 @@ from dtprob.gap.how_far.calibration import calibration
 from dtprob.gap.how_far.remainder import alone, model_remainder, shortlist
 from dtprob.gap.how_far.site_field import field_of
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.where.curves import curves
+from dtprob.gap.where.along import curves
 from dtprob.gap.where.families import Family, Pattern, deterministic, families
 from dtprob.gap.where.quantities import quantity
 from dtprob.gap.where.suspects import Suspect

@@ -10,7 +10,8 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.where.curves import Curves, curves, cycles, grouped
+from dtprob.gap.where.along import curves
+from dtprob.gap.where.curves import Curves, cycles, grouped
 from dtprob.gap.where.families import deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import family_test
 from dtprob.gap.where.quantities import Quantity, groups, quantity

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from scipy import sparse
 
-from dtprob.gap.where.curves import curves
+from dtprob.gap.where.along import curves
 from dtprob.gap.where.data_columns import all_columns, whole_columns
+from dtprob.gap.where.families import Family, Pattern, Summed
+from dtprob.gap.where.family_test import family_test
 from dtprob.gap.where.quantities import cells, groups, quantity, together
 
 
@@ -130,6 +132,22 @@ def test_every_two_of_a_dozen_columns_are_looked_over_together():
     found = curves_of(**{f"f{i}": rng.normal(size=400) for i in range(12)})
     assert sum(label.startswith("over ") for label in found) == 66
     assert sum(label.startswith("near a place") for label in found) == 6
+    products = found["product of two columns"]
+    assert products.overlaps
+    assert products.extent == (66, 400)
+    assert products.places[-1] == "f10 times f11"
+
+
+def test_a_product_of_two_columns_is_told_from_all_others():
+    rng = np.random.default_rng(10)
+    columns = {f"f{i}": rng.normal(size=3000) for i in range(8)}
+    products = curves_of(**columns)["product of two columns"]
+    scores = rng.normal(size=(200, 3000))
+    scores[0] += 0.12 * columns["f1"] * columns["f5"]  # 6.6 standard deviations
+    pattern = Pattern(products.label, (0,), products)
+    found = family_test(Family("additive", pattern, np.ones(())), pattern.scores(Summed(scores[..., None])))
+    assert found.p_value < 1e-6
+    assert found.label == "additive, f1 times f5"
 
 
 def test_a_group_may_differ_between_two_values_of_a_column_or_for_a_while():

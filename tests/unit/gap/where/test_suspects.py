@@ -6,7 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dtprob.gap.where.curves import Curves, curves
+from dtprob.gap.where.along import curves
+from dtprob.gap.where.curves import Curves
 from dtprob.gap.where.families import Family, Pattern, Summed
 from dtprob.gap.where.family_test import FamilyTest, family_test
 from dtprob.gap.where.suspects import plainest, suspects
