@@ -17,7 +17,7 @@ import numpy as np
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.where.curves import Curves
-from dtprob.gap.where.ordered import COLUMNS, Along, in_order
+from dtprob.gap.where.ordered import COLUMNS, Along, alike_and_by_last, in_order
 from dtprob.gap.where.quantities import Quantity
 from dtprob.models.axes import is_unnamed
 
@@ -209,12 +209,10 @@ def _patterns(along: Along, over: Over, site: Site) -> Iterator[Pattern]:
     """Pooled along axes, and along curves on one axis or over a quantity."""
     for kept in _kept_axes(site.value.shape):
         yield Pattern(" x ".join(site.axes[i] for i in kept) or "common", kept)
-    last = site.value.ndim - 1
     for i, axis in enumerate(site.axes):
-        for found in along(axis, site.value.shape[i]):
-            yield Pattern(found.label, (i,), found)
-            if i < last and 1 < site.value.shape[last] <= COLUMNS and found.extent[0] <= _MOST_BY_COLUMN:
-                yield Pattern(f"{found.label} x {site.axes[last]}", (i, last), found)
+        for one in along(axis, site.value.shape[i]):
+            of_one = alike_and_by_last(one, i, site.axes, site.value.shape, _MOST_BY_COLUMN)
+            yield from (Pattern(found.label, kept, found) for kept, found in of_one)
     for quantity, all_curves in over:
         if (kept := quantity.kept(site.axes, site.value.shape)) is not None:
             yield from (Pattern(found.label, kept, found) for found in all_curves)

@@ -47,6 +47,14 @@ def in_order(along: Along, axes: Sequence[str], shape: Sequence[int]) -> Found:
                 yield (0, 1), _of_each(found, axes[0], shape[0])
 
 
+def alike_and_by_last(found: Curves, i: int, axes: Sequence[str], shape: Sequence[int], most: int) -> Found:
+    """Curves along an axis, all else alike, and up to `most` of them for each entry of a short last axis, too."""
+    yield (i,), found
+    last = len(shape) - 1
+    if i < last and 1 < shape[last] <= COLUMNS and found.extent[0] <= most:
+        yield (i, last), replace(found, label=f"{found.label} x {axes[last]}")
+
+
 def _cycles(axes: Sequence[str], shape: Sequence[int]) -> Found:
     """What repeats along an axis, or along the rows of all clusters in their order, entry by entry of the other axes."""
     for i, axis in enumerate(axes):
@@ -65,9 +73,7 @@ def _stretches(axes: Sequence[str], shape: Sequence[int]) -> Found:
     last = len(shape) - 1
     for i, axis in enumerate(axes) if last > 0 else ():
         for found in stretches(shape[i], axis):
-            yield (i,), found
-            if i < last and 1 < shape[last] <= COLUMNS and found.extent[0] * shape[last] <= _MOST_BLOCKS:
-                yield (i, last), replace(found, label=f"{found.label} x {axes[last]}")
+            yield from alike_and_by_last(found, i, axes, shape, _MOST_BLOCKS // shape[last])
     if len(shape) not in (1, 2) or int(np.prod(shape)) > _MOST_OF_EACH:
         return
     for found in stretches(shape[-1], axes[-1]):

@@ -114,8 +114,7 @@ def cells(
     made = {n: np.unique(c, return_inverse=True)[1].reshape(c.shape) for n, c in columns.items()}
     few = {name: index for name, index in made.items() if 1 <= index.max() < GROUPS}
     wide = {name: _varies(index) for name, index in few.items()}
-    pairs = [(a, b) for a, b in itertools.combinations(few, 2) if wide[a] != wide[b] or len(wide[a]) > 1]
-    for one, other in pairs[:MOST_PAIRS]:
+    for one, other in _apart(itertools.combinations(few, 2), wide):
         index = joined(*np.broadcast_arrays(few[one], few[other]))
         if index is not None:
             whole = np.broadcast_to(index, shape)
@@ -142,19 +141,21 @@ def together(
     few = [name for name, index in made.items() if 1 <= index.max() < GROUPS]
     real = [n for n, index in made.items() if columns[n].dtype.kind == "f" and index.max() >= SMOOTH_FROM]
 
-    def apart(pairs: Iterable[tuple[str, str]]) -> list[tuple[str, str]]:
-        return [(a, b) for a, b in pairs if a != b and (wide[a] != wide[b] or len(wide[a]) > 1)][:MOST_PAIRS]
-
     def whole(one: str, other: str) -> Quantity:
         values = made[one].reshape(shape)
         return Quantity(f"{one} and {other}", tuple(axes), values, ordered=False, coded=True)
 
-    for one, other in apart(itertools.product(few, real)):
+    for one, other in _apart(itertools.product(few, real), wide):
         group = by_group(one, made[one], flat[one])
         yield from ((whole(one, other), found) for found in along_in_groups(group, other, flat[other]))
-    for one, other in apart(itertools.combinations(real, 2)):
+    for one, other in _apart(itertools.combinations(real, 2), wide):
         place = np.stack([flat[one], flat[other]], axis=1)
         yield from ((whole(one, other), found) for found in over_both((one, other), place))
+
+
+def _apart(pairs: Iterable[tuple[str, str]], wide: Mapping[str, tuple[int, ...]]) -> list[tuple[str, str]]:
+    """The first pairs of columns that do not both vary along the same single axis, from the axes of each."""
+    return [(a, b) for a, b in pairs if a != b and (wide[a] != wide[b] or len(wide[a]) > 1)][:MOST_PAIRS]
 
 
 def _varies(values: np.ndarray) -> tuple[int, ...]:
