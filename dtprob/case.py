@@ -11,6 +11,8 @@ from dtprob.errors import InputError, unknown_name
 
 type Phase = Literal["coherent", "per_packet", "none"]
 type Options = Mapping[str, Any]
+type Words = Mapping[str, tuple[str, ...]]
+"""For each column its words in the order of their numbers, from 0."""
 Share = NewType("Share", float)
 
 PHASES: tuple[Phase, ...] = ("coherent", "per_packet", "none")
@@ -43,6 +45,7 @@ class DataSection:
             ranks them. What is observed in them is not looked at.
         phase: what the phases of the data mean; "coherent" unless said.
         cluster: the column or axis whose values belong together; the model's own unless said.
+        words: for columns of words in a table for a model of the user's own, the words in the order of their numbers.
         options: settings of the reader, for data that have some.
     """
 
@@ -51,6 +54,7 @@ class DataSection:
     designs: Path | None = None
     phase: Phase | None = None
     cluster: str | None = None
+    words: Words = field(default_factory=dict)
     options: Options = field(default_factory=dict)
 
 
@@ -323,6 +327,10 @@ def _is_names(value: Any) -> bool:
     return _is_text(value) or (isinstance(value, list) and all(map(_is_text, cast("list[Any]", value))))
 
 
+def _are_lists(value: Mapping[str, Any]) -> bool:
+    return all(isinstance(listed, list) and _is_names(listed) for listed in value.values())
+
+
 _KINDS: dict[Any, tuple[str, Any]] = {
     str: ("text", _is_text),
     str | None: ("text", _is_text),
@@ -336,6 +344,7 @@ _KINDS: dict[Any, tuple[str, Any]] = {
     str | tuple[str, ...]: ("'all', a list of names, or 'module:name'", _is_names),
     tuple[str, ...]: ("a list of names", lambda value: isinstance(value, list) and _is_names(value)),
     Options: ("a table of settings", lambda value: isinstance(value, Mapping)),
+    Words: ("a table of lists of words", lambda value: isinstance(value, Mapping) and _are_lists(value)),
     Phase | None: (f"one of {', '.join(PHASES)}", lambda value: value in PHASES),
 }
 """For each type of a field: what it is in words, and the test for it."""
@@ -347,6 +356,7 @@ _CONVERT: dict[Any, Any] = {
     str | tuple[str, ...]: lambda value: value if isinstance(value, str) else tuple(value),
     tuple[str, ...]: tuple,
     Options: dict,
+    Words: lambda value: {name: tuple(listed) for name, listed in value.items()},
 }
 
 

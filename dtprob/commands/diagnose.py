@@ -21,6 +21,7 @@ from dtprob.gap.withheld.rivals.compete import compete
 from dtprob.inference import Posterior
 from dtprob.report import render, to_json
 from dtprob.workflow import Prepared
+from dtprob.workflow.words import spelled
 
 RESULTS = ("gap.nc", "report.html", "report.json")
 
@@ -108,8 +109,10 @@ def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tupl
         say=job.say,
     )
     report = diagnosis.to_report()
+    words = prepared.case.data.words
     provenance = {**report.get("provenance", {}), "dtprob": edition(), **prepared.provenance}
-    return {**report, "provenance": provenance}, diagnosis.to_datatree()
+    provenance |= {"words": {name: list(listed) for name, listed in words.items()}} if words else {}
+    return spelled({**report, "provenance": provenance}, words), diagnosis.to_datatree()
 
 
 def write_diagnosis(out: Path, report: Mapping[str, Any], gap: DataTree, *, title: str) -> None:

@@ -1,5 +1,7 @@
 """The figures of a page over the data's coordinates: the gap, data against the twin, and what a cause closes where."""
 
+from collections.abc import Mapping, Sequence
+
 import numpy as np
 import xarray as xr
 
@@ -32,19 +34,20 @@ def difference_charts(report: Report, gap: xr.DataTree | None) -> list[Chart]:
     """Data less twin along each column of the data, in their own unit, with its sign."""
     data = group(gap, "differences", report)
     return [
-        _difference_chart(data, i)
+        _difference_chart(data, i, report["provenance"].get("words", {}))
         for i in range(len(data.dims))
         if (data[f"before_{i}"] + data[f"spread_{i}"]).count()
     ]
 
 
-def _difference_chart(data: xr.Dataset, index: int) -> Chart:
+def _difference_chart(data: xr.Dataset, index: int, spelt: Mapping[str, Sequence[str]]) -> Chart:
     place, before, spread = (data[f"{name}_{index}"].values for name in ("place", "before", "spread"))
     after, said = data.get(f"after_{index}"), data[f"place_{index}"].attrs
     name, unit = capital(words(str(said["column"]))), said["unit"]
     limit = usual_limit(int(said["of"])) * spread
+    names = _names(place, spelt.get(str(said["column"]), ()))
     figure = coordinate_map(
-        place,
+        names,
         before,
         None if after is None else after.values,
         label=name,
@@ -56,8 +59,17 @@ def _difference_chart(data: xr.Dataset, index: int) -> Chart:
         f"{name}: above 0 the data ({words(str(said['observed']))}) are larger than the twin says, on average. "
         "Grey: where all values along all columns stay, in 95 of 100 cases, when the twin is right."
     )
-    most = f"{number(float(before[far]))} at {number(float(place[far]))}"
+    top = names[far] if names.dtype.kind == "U" else number(float(place[far]))
+    most = f"{number(float(before[far]))} at {top}"
     return Chart(inline_svg(figure, f"Data less twin along {words(str(said['column']))}: {most}."), caption)
+
+
+def _names(place: np.ndarray, listed: Sequence[str]) -> np.ndarray:
+    """Places of a column of words by their words; of others, and where places stand for several words, as they are."""
+    number = place.astype(int)
+    if not listed or np.any(number != place) or number.min() < 0 or number.max() >= len(listed):
+        return place
+    return np.array([listed[k] for k in number])
 
 
 def _coordinate_chart(data: xr.Dataset, axis: str, *, quiet: bool, named: bool) -> Chart:

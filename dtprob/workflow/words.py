@@ -1,0 +1,123 @@
+"""Columns of words in a table of the user's own: each word is a number, its place in a list of the CASE."""
+
+import re
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from dtprob.case import Words
+from dtprob.errors import InputError, nearest, unknown_name
+
+_MOST: Final = 24
+"""Different words up to which a column is told as a list that the CASE could have."""
+_PLACED: Final = (("where", "sites"), ("unlisted", "located"))
+"""Where a report tells of places."""
+
+
+def coded(file: Path, columns: Mapping[str, Any], words: Words, taken: Collection[str]) -> dict[str, Any]:
+    """The columns of a table with whole numbers for words.
+
+    Args:
+        file: the table.
+        columns: by name.
+        words: of the columns that hold words.
+        taken: names of the columns that the model takes; words in others stay as they are.
+
+    Raises:
+        InputError: a word that its list does not have, a list for a column that holds numbers, or a column of words that
+            the model takes and no list is for.
+    """
+    result = dict(columns)
+    for name, column in columns.items():
+        text = np.asarray(column)
+        is_text = text.dtype.kind == "U"
+        if name in words:
+            if not is_text:
+                remedy = f"Leave {name} out of [data.words]"
+                raise InputError(f"{file.name}, column {name!r}", "words", "numbers", remedy)
+            result[name] = _numbers(file, name, text, words[name])
+        elif is_text and name in taken and _are_names(text):
+            found = sorted(set(text.tolist()))
+            listed = ", ".join(f'"{word}"' for word in found)
+            remedy = f"Number its words in the CASE: [data.words] {name} = [{listed}]"
+            raise InputError(f"{file.name}, column {name!r}", "numbers", f"words ({text[0]!r} first)", remedy)
+    return result
+
+
+def check_words(where: str, words: Words, columns: Collection[str]) -> None:
+    """Refuse lists of words for columns that are not there, and lists that have a word twice.
+
+    Args:
+        where: what to call the lists in an error.
+        words: of columns.
+        columns: names of those that the table has.
+
+    Raises:
+        InputError: such a list.
+    """
+    for name, listed in words.items():
+        if name not in columns:
+            raise unknown_name(where, name, columns, "column")
+        twice = [word for word in listed if listed.count(word) > 1]
+        if twice:
+            raise InputError(
+                f"{where} {name}", "words that differ", f"{twice[0]!r} twice", "Leave one of them out"
+            )
+
+
+def spelled(report: Mapping[str, Any], words: Words) -> dict[str, Any]:
+    """A diagnosis' report whose places are called by their words: `site harbour` for `site 0`.
+
+    Args:
+        report: its content.
+        words: of the table's columns.
+    """
+    result, called = dict(report), dict[str, str]()
+    for part, entry in _PLACED if words else ():
+        section = result.get(part) or {}
+        for site in section.get(entry, []):
+            if "place" in site:
+                called[site["place"]] = _spelled(site["place"], words)
+        if entry in section:
+            sites = [
+                {**site, "place": called[site["place"]]} if "place" in site else site
+                for site in section[entry]
+            ]
+            result[part] = {**section, entry: sites}
+    for place, name in called.items():
+        result["summary"] = result.get("summary", "").replace(f"at {place}", f"at {name}")
+    return result
+
+
+def _numbers(file: Path, name: str, text: np.ndarray, listed: Sequence[str]) -> np.ndarray:
+    number = {word: k for k, word in enumerate(listed)}
+    for row, word in enumerate(text.tolist()):
+        if word not in number:
+            close = nearest(word, listed)
+            remedy = (
+                f"Did you mean {close!r}?" if close else f"Correct it, or add it to {name} in [data.words]"
+            )
+            expected = f"one of {', '.join(listed)}"
+            raise InputError(f"{file.name}, column {name!r}, row {row}", expected, repr(word), remedy)
+    return np.array([number[word] for word in text.tolist()])
+
+
+def _are_names(text: np.ndarray) -> bool:
+    """Whether words are so few that a list of them is what is wanted, and neither numbers nor points in time."""
+    found = set(text.tolist())
+    return (
+        text.ndim == 1
+        and 0 < len(found) <= _MOST
+        and not any(word[:1].isdigit() or not word for word in found)
+    )
+
+
+def _spelled(place: str, words: Words) -> str:
+    for name, listed in words.items():
+        pattern = rf"(?<!\w){re.escape(name)} (\d+)(?![\w.]| to)"
+        place = re.sub(
+            pattern, lambda found, name=name, listed=listed: f"{name} {listed[int(found[1])]}", place
+        )
+    return place
