@@ -54,6 +54,17 @@ _SITES = {
     "y": "readings",
 }
 
+_WAYS: Final = {
+    "common": "by one amount for all",
+    "smooth": "smoothly {rest}",
+    "every": "in a cycle of {rest}",
+    "ripple": "as a {whole}",
+    **dict.fromkeys(("by", "along", "over", "beyond", "between", "near"), "{whole}"),
+    **{part: f"from {part} to {{whole}}" for part in ("stretch", "block")},
+    "product": "with the {whole}",
+}
+"""How a way of varying is told, by its first word."""
+
 LEVEL = 0.05
 LOG: Final = "log_"
 _LARGEST: Final = 700.0
@@ -125,16 +136,14 @@ def allowance(remainder: Remainder) -> str:
 
 
 def _varying(pattern: str) -> str:
-    """How a site family varies, in words: `from link to link`, `as a ripple in time`, `in a cycle of 7 along slot`."""
-    first = pattern.partition(" ")[0]
-    if pattern == "common":
-        return "by one amount for all"
-    if first == "smooth":
-        return f"smoothly {words(pattern.removeprefix('smooth '))}"
-    if first == "every":
-        return f"in a cycle of {words(pattern.removeprefix('every '))}"
-    if first in ("ripple", "by", "along", "over"):
-        return f"as a {words(pattern)}" if first == "ripple" else words(pattern)
+    """How a site family varies, in words: `from link to link`, `as a ripple in time`, `at hour 3 to 5`."""
+    first, _, rest = pattern.partition(" ")
+    if first in _WAYS:
+        return _WAYS[first].format(whole=words(pattern), rest=words(rest))
+    if " times " in pattern:
+        return f"with {words(pattern)}"
+    if re.search(r" \d", pattern):  # a place
+        return f"at {words(pattern)}"
     axes = [words(axis) for axis in pattern.split(" x ")]
     if len(axes) == 1:
         return f"from {axes[0]} to {axes[0]}"

@@ -12,8 +12,9 @@ from dtprob.errors import InputError, nearest, unknown_name
 
 _MOST: Final = 24
 """Different words up to which a column is told as a list that the CASE could have."""
-_PLACED: Final = (("where", "sites"), ("unlisted", "located"))
+_PLACED: Final = (("where", "sites"), ("unlisted", "located"), ("remainder", "terms"))
 """Where a report tells of places."""
+_KEYS: Final = ("place", "family", "shape")
 
 
 def coded(file: Path, columns: Mapping[str, Any], words: Words, taken: Collection[str]) -> dict[str, Any]:
@@ -75,17 +76,13 @@ def spelled(report: Mapping[str, Any], words: Words) -> dict[str, Any]:
         words: of the table's columns.
     """
     result, called = dict(report), dict[str, str]()
-    for part, entry in _PLACED if words else ():
+    for part, name in _PLACED if words else ():
         section = result.get(part) or {}
-        for site in section.get(entry, []):
-            if "place" in site:
-                called[site["place"]] = _spelled(site["place"], words)
-        if entry in section:
-            sites = [
-                {**site, "place": called[site["place"]]} if "place" in site else site
-                for site in section[entry]
-            ]
-            result[part] = {**section, entry: sites}
+        if name in section:
+            called |= {
+                entry["place"]: _spelled(entry["place"], words) for entry in section[name] if "place" in entry
+            }
+            result[part] = {**section, name: [_with_words(entry, words) for entry in section[name]]}
     for place, name in called.items():
         result["summary"] = result.get("summary", "").replace(f"at {place}", f"at {name}")
     return result
@@ -112,6 +109,10 @@ def _are_names(text: np.ndarray) -> bool:
         and 0 < len(found) <= _MOST
         and not any(word[:1].isdigit() or not word for word in found)
     )
+
+
+def _with_words(entry: Mapping[str, Any], words: Words) -> dict[str, Any]:
+    return {key: _spelled(said, words) if key in _KEYS and said else said for key, said in entry.items()}
 
 
 def _spelled(place: str, words: Words) -> str:

@@ -127,6 +127,15 @@ def test_places_are_called_by_their_words(place, said):
     assert found["summary"] == f"A gap at mean; most of it at {said}."
 
 
+def test_so_are_ways_to_vary():
+    report = {"where": {"sites": [{"family": "spread, site 2, distance 3 to 5", "p_value": 0.1}]}}
+    report["remainder"] = {"terms": [{"shape": "additive, along distance by site", "weights": 3}]}
+    found = spelled(report, {"site": SITES})
+    assert found["where"]["sites"] == [{"family": "spread, site tower, distance 3 to 5", "p_value": 0.1}]
+    assert found["remainder"] == report["remainder"]
+    assert spelled({**report, "remainder": None}, {"site": SITES})["remainder"] is None
+
+
 def test_a_diagnosis_speaks_of_words(tmp_path):
     random = np.random.default_rng(0)
     rows = "\n".join(
