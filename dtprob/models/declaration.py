@@ -17,6 +17,7 @@ import numpy as np
 import numpyro
 from numpyro import handlers
 from numpyro.distributions import constraints, distribution
+from numpyro.primitives import Messenger
 
 from dtprob.errors import InputError, raised_at
 from dtprob.models.arguments import Data, Model, model_name, select_arguments, split_static, whole
@@ -202,6 +203,15 @@ def _misfit(function: Model, error: Exception, trace: Mapping[str, Mapping[str, 
     return InputError(f"model {model_name(function)}{where}", "arrays whose shapes fit", got, remedy)
 
 
+class _Names(Messenger):
+    """Remembers the last site that a run came to."""
+
+    last: str | None = None
+
+    def process_message(self, msg: dict[str, Any]) -> None:
+        self.last = msg.get("name") or self.last
+
+
 def declare(function: Model, data: Data, *, cluster: str | None = None) -> Declaration:
     """Run the model once, abstractly, and tell its sites and axes.
 
@@ -228,16 +238,17 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
                 found[name] = site
 
     arrays, static = split_static(data)
+    names = _Names()
     try:
-        jax.eval_shape(run, arrays, jax.random.key(0))
+        with names:
+            jax.eval_shape(run, arrays, jax.random.key(0))
     except NotImplementedError as error:
         if "control flow" in str(error):
             what, inside = f"model {model_name(function)}", "Move the plate into the function that is scanned"
             raise InputError(what, "no scan within a plate", "one", inside) from error
+        what, got = f"model {model_name(function)}", f"one that cannot at {names.last!r}"
         remedy = "Give every parameter a proper prior; a wide one will do"
-        raise InputError(
-            f"model {model_name(function)}", "distributions that can be drawn from", "one that cannot", remedy
-        ) from error
+        raise InputError(what, "distributions that can be drawn from", got, remedy) from error
     except NOT_TRACED as error:
         what, got = f"model {model_name(function)}", str(error).split("\n", maxsplit=1)[0]
         remedy = "Use jnp.where or lax.cond for `if`, jnp for np, and give sizes as plain numbers"

@@ -188,3 +188,13 @@ def test_a_plate_of_another_size_than_its_data_is_named_with_its_place():
         declare(short, {"x": jnp.zeros(7), "y": jnp.zeros(7)})
     with pytest.raises(TypeError, match="unhashable"):  # what a model raises of itself is left alone
         declare(lambda x, y=None: {x: y}[[]], {"x": jnp.zeros(7), "y": jnp.zeros(7)})
+
+
+def test_a_prior_that_cannot_be_drawn_from_is_named():
+    def improper(y=None):
+        numpyro.sample("scale", dist.LogNormal(0.0, 1.0))
+        level = numpyro.sample("level", dist.ImproperUniform(dist.constraints.real, (), ()))
+        numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+    with pytest.raises(InputError, match=r"one that cannot at 'level'\. Give every parameter a proper prior"):
+        declare(improper, {"y": jnp.zeros(3)})
