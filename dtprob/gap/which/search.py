@@ -21,7 +21,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View, view
 from dtprob.gap.which.stand_in import stands_in
-from dtprob.gap.which.trials import Say, Start, Trials, best, credit, tried
+from dtprob.gap.which.trials import Say, Start, Trials, best, credit, remembered, tried
 
 _RETURNS: Final = 3
 """Times that a search may find its starting fit to be no optimum."""
@@ -195,7 +195,8 @@ def _forward(
         ):
             return [*steps, Step(seen, Trials(problem, {}), None)]
         visited[frozenset(fitted.effects)] = seen
-        trials = begun.trials if begun else tried(seen, settings, say, banned=banned)
+        earlier = remembered(steps[0].view, steps[0].trials, seen) if steps else {}
+        trials = begun.trials if begun else tried(seen, settings, say, banned=banned, earlier=earlier)
         problem = trials.problem
         may_return = returns < _RETURNS and begun is None
         better = without(problem, seen.fitted, trials.fits, settings.polished) if may_return else None

@@ -39,6 +39,10 @@ _HOPELESS: Final = 0.05
 """Share of the best candidate's promise below which another one is not refitted."""
 _WORTH: Final = 3.0
 """Nats that an effect has to gain in a scan."""
+_MUCH: Final = 0.4
+"""Share of the best one's gain from which on a candidate is remembered."""
+_REMEMBERED: Final = 2
+"""Candidates that are remembered at most."""
 _POLISHED_LATER: Final = 1
 """New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
@@ -69,6 +73,27 @@ class Trials:
 
 
 NOTHING: Final[Mapping[str, Start]] = MappingProxyType({})
+NONE_FOUND: Final[Mapping[str, Found]] = MappingProxyType({})
+
+
+def remembered(before: View, trials: Trials, seen: View) -> dict[str, Found]:
+    """Mean effects that gained much at an earlier step, at their sizes there, beside what has been accepted since.
+
+    Scores at the null of one that has to be large may tell nothing of it.
+
+    Args:
+        before: the fit at that step.
+        trials: refits there.
+        seen: the fit now.
+    """
+    gain = {name: one.log_evidence - before.fitted.log_evidence for name, one in trials.fits.items()}
+    least = max(_WORTH, _MUCH * max(gain.values(), default=0.0))
+    able = {e.name: e for e in seen.problem.effects if e.kind == "mean" and e.name not in seen.fitted.effects}
+    most = sorted(
+        (name for name in gain if name in able and gain[name] > least), key=lambda name: -gain[name]
+    )
+    index = {name: trials.problem.layout.of(able[name]) for name in most[:_REMEMBERED]}
+    return {name: Found(gain[name], seen.fitted.x, trials.fits[name].x[at]) for name, at in index.items()}
 
 
 def tried(
@@ -78,6 +103,7 @@ def tried(
     known: Mapping[str, Start] = NOTHING,
     *,
     banned: str | None = None,
+    earlier: Mapping[str, Found] = NONE_FOUND,
 ) -> Trials:
     """Refits of the most promising candidates beside the effects of a view, without those that stay at their null.
 
@@ -87,13 +113,14 @@ def tried(
         say: receives one line for each.
         known: candidates to refit in any case, by name, with where to start.
         banned: a candidate that is not to be tried.
+        earlier: candidates that gained much before; see `remembered`.
     """
     screening, fitted = seen.screening, seen.fitted
     scans: list[dict[str, Found]] = []
     if not fitted.effects and seen.promise > _LARGE_GAP:
         say("scanning the effects' plausible sizes")
         scans = _scans(seen)
-    chosen = [n for n in _chosen(seen, scans, settings, banned) if n not in known]
+    chosen = [n for n in dict.fromkeys([*_chosen(seen, scans, settings, banned), *earlier]) if n not in known]
     problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
     effects = {e.name: e for e in problem.effects}
@@ -103,7 +130,7 @@ def tried(
         starts = starting_points(problem, start.x, effects[name], screening.step.get(name), settings)
         starts += [
             _scanned_start(problem, seen.problem, effects[name], found[name])
-            for found in scans
+            for found in (*scans, earlier)
             if name in found
         ]
         trials[name] = refit(problem, start, effects[name], starts)
