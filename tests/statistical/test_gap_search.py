@@ -41,6 +41,24 @@ def wave(name, *parts):
 EFFECTS = (wave("one", (1.0, 3.0)), wave("two", (1.0, 5.0)), wave("both", (1.0, 3.0), (1.0, 5.0), (0.5, 9.0)))
 
 
+def turning(name):
+    """A sine of unknown frequency, whose slope at its null may point the wrong way."""
+
+    def rewrite(value, p, context):
+        return value + 1.2 * jnp.sin(p["frequency"] * context["x"])
+
+    return Effect(name, {"mean": rewrite}, (Parameter("frequency", dist.HalfNormal(3.0)),))
+
+
+def far(name):
+    """An effect of some streets."""
+    return Effect(
+        name,
+        {"mean": lambda value, p, context: value + p["c"] * (context["street"] < 8)},
+        (Parameter("c", dist.Normal(0.0, 1.0)),),
+    )
+
+
 def rows(seed, shift=lambda x: 0.0 * x, spread=lambda street: 1.0 + 0.0 * street):
     rng = np.random.default_rng((seed, 5))
     x, street = rng.uniform(-np.pi, np.pi, LENGTH), rng.integers(0, 24, LENGTH)
@@ -114,3 +132,13 @@ def test_a_family_that_says_the_same_in_another_form_takes_nothing_back(seed):
 def test_nothing_is_found_where_there_is_nothing():
     """Four diagnoses at a level of 1%: one alarm has probability .04, two .0006."""
     assert sum(look(rows(10 + s), s)[0].view.alarmed(SETTINGS) for s in range(4)) <= 1
+
+
+def test_an_effect_whose_slope_at_its_null_misleads_is_found_beside_another():
+    data = rows(3)
+    x, street = data["x"], data["street"]
+    data["y"] += 4.0 * (street < 8) + 1.2 * jnp.sin(4.0 * x)
+    problem, key = Problem(table, data, (turning("turn"), far("step")), "street"), jax.random.key(3)
+    steps = search(problem, fit_base(problem, key), key, SETTINGS, print).steps
+    assert steps[0].accepted == "step"
+    assert set(steps[-1].view.fitted.effects) == {"step", "turn"}

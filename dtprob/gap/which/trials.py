@@ -39,7 +39,7 @@ _HOPELESS: Final = 0.05
 """Share of the best candidate's promise below which another one is not refitted."""
 _WORTH: Final = 3.0
 """Nats that an effect has to gain in a scan."""
-_MUCH: Final = 0.4
+_MUCH: Final = 0.1
 """Share of the best one's gain from which on a candidate is remembered."""
 _REMEMBERED: Final = 2
 """Candidates that are remembered at most."""
