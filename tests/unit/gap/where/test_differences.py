@@ -167,7 +167,7 @@ def test_they_are_drawn_with_their_unit_and_largest_place():
         "spread_0": ("group_0", np.full(3, 0.5), said),
     }
     tree = xr.DataTree.from_dict({"/differences": xr.Dataset(values)})
-    report = {"gap": {"after": None}}
+    report = {"gap": {"after": None}, "provenance": {}}
     (chart,) = difference_charts(report, tree)  # pyright: ignore[reportArgumentType]
     assert "−4.00 at 2.00" in chart.svg
     assert "Data less twin (dB)" in chart.svg

@@ -71,6 +71,7 @@ def test_a_search_that_goes_in_a_circle_ends_where_most_credit_is(monkeypatch):
 
     monkeypatch.setattr(search, "_looked", looked)
     monkeypatch.setattr(search, "tried", tried)
+    monkeypatch.setattr(search, "remembered", lambda *_: {})
     monkeypatch.setattr(search, "best", lambda seen, base, trials, settings: next(iter(trials)))
     monkeypatch.setattr(search, "without", lambda *_: None)
     monkeypatch.setattr(search, "_revised", lambda *_, **__: [])
