@@ -92,14 +92,15 @@ def _column(name: str, entry: Any) -> Any:
         return entry  # a list of words is a setting
     if not array.size:
         raise InputError(f"data {name!r}", "at least one value", "none", "Give a row for each reading.")
-    odd = [k for k, value in enumerate(array.reshape(-1)) if not _is_number(value)]
+    odd = [k for k, value in enumerate(array.reshape(-1)) if not is_number(value)]
     got = f"{str(array.reshape(-1)[odd[0]])!r} at index {odd[0]}" if odd else "numbers as text"
     words = "Give each word a whole number (the first of pandas.factorize), each time seconds, or leave the column out."
     repair = "Write it as a number, or mask the reading."
     raise InputError(f"data {name!r}", "numbers", got, words if 2 * len(odd) > array.size else repair)
 
 
-def _is_number(value: Any) -> bool:
+def is_number(value: Any) -> bool:
+    """Whether a value, or what a word says, is a number."""
     try:
         float(value)
     except (TypeError, ValueError):

@@ -171,19 +171,21 @@ def _arguments(
     takes = inspect.signature(model).parameters
     needs_paths = "paths" in takes
     if case.model.name in MODELS:
-        check_words(f"{case.path.name} [data.words]", case.data.words, ())
         data = _expected(read(file, case.data.options), MODELS[case.model.name].data, file, case)
     elif needs_paths:
         data = _expected(read(file, case.data.options), ChannelData, file, case)
     else:
         data = read_table(file)
+    if observed:  # designs may lack the columns that are
+        named = data.arrays() if isinstance(data, Table) else ()
+        check_words(f"{case.path.name} [data.words]", case.data.words, named)
     paths = None
     if needs_paths and isinstance(data, ChannelData | PowerData):
         data, paths = reached(case, data, cache, say)
     arrange = MODELS[case.model.name].arranger() if case.model.name in MODELS else None
     columns = data.arrays() if arrange is None else _arranged(case, arrange, data)
     if isinstance(data, Table):
-        columns = _in_numbers(case, file, columns, takes, observed=observed)
+        columns = coded(file, columns, case.data.words, takes)
     arguments = {name: _as_jax(array) for name, array in columns.items() if name in takes}
     if case.data.cluster is not None and case.data.cluster in columns:
         arguments[case.data.cluster] = columns[case.data.cluster]
@@ -198,15 +200,6 @@ def _arguments(
     if observed and case.model.name not in MODELS:
         check_columns(file, taking(model, arguments, case.data.cluster), arguments, columns)
     return arguments
-
-
-def _in_numbers(
-    case: Case, file: Path, columns: Mapping[str, Any], takes: Iterable[str], *, observed: bool
-) -> dict[str, Any]:
-    """The columns of a table with whole numbers for words; designs may lack those that are observed."""
-    if observed:
-        check_words(f"{case.path.name} [data.words]", case.data.words, columns)
-    return coded(file, columns, case.data.words, set(takes))
 
 
 def _phase(case: Case, data: Data, *, takes: bool) -> dict[str, Any]:

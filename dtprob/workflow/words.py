@@ -9,12 +9,15 @@ import numpy as np
 
 from dtprob.case import Words
 from dtprob.errors import InputError, nearest, unknown_name
+from dtprob.models.arguments import is_number
 
 _MOST: Final = 24
 """Different words up to which a column is told as a list that the CASE could have."""
+_TIME: Final = re.compile(r"\d+[-/:]\d")
+"""How a date or a time of day begins."""
 _PLACED: Final = (("where", "sites"), ("unlisted", "located"), ("remainder", "terms"))
 """Where a report tells of places."""
-_KEYS: Final = ("place", "family", "shape")
+_KEYS: Final = ("place", "family", "shape", "summary")
 
 
 def coded(file: Path, columns: Mapping[str, Any], words: Words, taken: Collection[str]) -> dict[str, Any]:
@@ -75,17 +78,12 @@ def spelled(report: Mapping[str, Any], words: Words) -> dict[str, Any]:
         report: its content.
         words: of the table's columns.
     """
-    result, called = dict(report), dict[str, str]()
-    for part, name in _PLACED if words else ():
+    result = dict(report)
+    for part, name in _PLACED:
         section = result.get(part) or {}
         if name in section:
-            called |= {
-                entry["place"]: _spelled(entry["place"], words) for entry in section[name] if "place" in entry
-            }
             result[part] = {**section, name: [_with_words(entry, words) for entry in section[name]]}
-    for place, name in called.items():
-        result["summary"] = result.get("summary", "").replace(f"at {place}", f"at {name}")
-    return result
+    return _with_words(result, words)
 
 
 def _numbers(file: Path, name: str, text: np.ndarray, listed: Sequence[str]) -> np.ndarray:
@@ -104,21 +102,18 @@ def _numbers(file: Path, name: str, text: np.ndarray, listed: Sequence[str]) -> 
 def _are_names(text: np.ndarray) -> bool:
     """Whether words are so few that a list of them is what is wanted, and neither numbers nor points in time."""
     found = set(text.tolist())
-    return (
-        text.ndim == 1
-        and 0 < len(found) <= _MOST
-        and not any(word[:1].isdigit() or not word for word in found)
-    )
+    is_name = (word and not is_number(word) and not _TIME.match(word) for word in found)
+    return text.ndim == 1 and 0 < len(found) <= _MOST and all(is_name)
 
 
 def _with_words(entry: Mapping[str, Any], words: Words) -> dict[str, Any]:
     return {key: _spelled(said, words) if key in _KEYS and said else said for key, said in entry.items()}
 
 
-def _spelled(place: str, words: Words) -> str:
+def _spelled(text: str, words: Words) -> str:
+    """The text with words for single numbers of their columns; an axis of the same name may be longer than the list."""
     for name, listed in words.items():
-        pattern = rf"(?<!\w){re.escape(name)} (\d+)(?![\w.]| to)"
-        place = re.sub(
-            pattern, lambda found, name=name, listed=listed: f"{name} {listed[int(found[1])]}", place
-        )
-    return place
+        number = {f"{name} {k}": f"{name} {word}" for k, word in enumerate(listed)}
+        pattern = rf"(?<!\w){re.escape(name)} \d+(?!\w|\.\d| to)"
+        text = re.sub(pattern, lambda found, number=number: number.get(found[0], found[0]), text)
+    return text

@@ -72,10 +72,6 @@ class Trials:
         return Start(self.fits[name].within(self.problem), self.fits[name])
 
 
-NOTHING: Final[Mapping[str, Start]] = MappingProxyType({})
-NONE_FOUND: Final[Mapping[str, Found]] = MappingProxyType({})
-
-
 def remembered(before: View, trials: Trials, seen: View) -> dict[str, Found]:
     """Mean effects that gained much at an earlier step, at their sizes there, beside what has been accepted since.
 
@@ -100,10 +96,10 @@ def tried(
     seen: View,
     settings: Settings,
     say: Say,
-    known: Mapping[str, Start] = NOTHING,
+    known: Mapping[str, Start] = MappingProxyType({}),
     *,
     banned: str | None = None,
-    earlier: Mapping[str, Found] = NONE_FOUND,
+    earlier: Mapping[str, Found] = MappingProxyType({}),
 ) -> Trials:
     """Refits of the most promising candidates beside the effects of a view, without those that stay at their null.
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -98,6 +99,20 @@ def test_what_is_wrong_is_said_with_what_to_do(tmp_path, rows, more, told):
     assert re.search(told, str(caught.value)), str(caught.value)
 
 
+def test_names_may_begin_with_a_digit(tmp_path):
+    bands = "\n".join(f"{10.0 + i},{('2.4GHz', '5GHz')[i % 2]},{-60.0 - i % 7}" for i in range(30))
+    with pytest.raises(InputError, match=r'\[data.words\] site = \["2.4GHz", "5GHz"\]'):
+        prepare(case(tmp_path, rows=bands), need="fit")
+
+
+def test_data_that_are_no_table_have_no_columns_of_words(tmp_path):
+    told = case(tmp_path, rows=ROWS, more=WORDS)
+    example = Path(__file__).parents[3] / "examples" / "labels"
+    table = replace(told.data, file=example / "rssi.csv")
+    with pytest.raises(InputError, match=r"\[data.words\]: expected no columns, got 'site'"):
+        prepare(replace(told, model=load_case(example / "case.toml").model, data=table), need="fit")
+
+
 def test_times_and_odd_cells_are_not_taken_for_names(tmp_path):
     stamped = "\n".join(f"{10.0 + i},2026-01-{1 + i % 3:02d},{-60.0 - i % 7}" for i in range(30))
     with pytest.raises(InputError, match="each time seconds"):
@@ -112,6 +127,8 @@ def test_times_and_odd_cells_are_not_taken_for_names(tmp_path):
         ("site 0 to 1", "site 0 to 1"),
         ("site 0.5", "site 0.5"),
         ("campsite 1", "campsite 1"),
+        ("site 3", "site 3"),
+        ("site 11", "site 11"),
         ("row 1", "row 1"),
     ],
 )
