@@ -121,7 +121,8 @@ def fit(
         if not system.finite:
             return _hopeless(active, x)
         patience -= fresh
-        solved = curved(problem, active, x, system) if may_curve and patience < 0 and fresh else system
+        is_curved = may_curve and patience < 0
+        solved = curved(problem, active, x, system) if is_curved and fresh else system
         trial = _better(problem, active, solved, x, value=value, damping=damping, tolerance=tolerance)
         gained = trial.value - value
         better = gained > 0
@@ -129,16 +130,21 @@ def fit(
         if better:
             x, value = _guarded(problem, active, x, trial.x), trial.value
             damping = max(trial.damping / 8, _LEAST_DAMPING)
+        elif trial.gain >= tolerance:
+            damping = trial.damping
         change = 0.0
-        if active.spread:
+        if active.spread and (
+            fresh or not is_curved
+        ):  # by one kind of curvature: by the other it would be another one
             active, change, latest = respread(problem, active, x, system, latest)
             value = value_of(problem, active, x)
         converged = converged and change < _SETTLED
         ends = converged or not (better or change >= _SETTLED)
         if ends and fresh:  # kept curvatures may promise too little where they have fallen since
-            if converged or patience < 0 or not may_curve:
+            if converged:
                 break
-            patience, damping = 0, _FIRST_DAMPING
+            if may_curve and patience >= 0:
+                patience, damping = 0, _FIRST_DAMPING
         as_promised = _AS_PROMISED[0] * trial.gain < gained < _AS_PROMISED[1] * trial.gain
         last = solved if as_promised and not ends and change < _ALIKE else None
     return _finish(problem, active, x, value, converged)

@@ -29,6 +29,8 @@ _ROUNDS: Final = 10
 _SHARES: Final = (1.0, 0.5, 0.25, 0.1, 0.03)
 _ARRIVED: Final = 0.01
 """Nats by which a round has to be better."""
+_UNDERWAY: Final = 1.0
+"""Nats by which a round was better if the next one's point is hardly the mode: how the volume bends is kept there."""
 _FAR: Final = 1.0
 """Standard deviations of the prior that a coordinate moves in the first round at most."""
 _FARTHER: Final = 4.0
@@ -44,6 +46,8 @@ _FLAT: Final = 1e-4
 """Nats by which the volume bends along a coordinate, over its posterior, below which it is not looked at with others; and
 beside states those by which it changes over a step."""
 _EXACT: Final = 1e-7
+_ROUGH: Final = 1e-5
+"""Nats that a step to the mode of what is integrated out may promise per cluster, at the end and underway."""
 _FAITHFUL: Final = 0.5
 """Nats that the expansion may be off at a fit."""
 
@@ -126,9 +130,10 @@ def fitted_at(
 
 def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Around) -> Mode:
     """The mode of the marginal density, from a point and the log density there."""
-    reach = _FAR
+    reach, gain, volume = _FAR, 0.0, None
     for _ in range(_ROUNDS):
-        volume = _expanded(problem, here, free)
+        is_underway = volume is not None and gain > _UNDERWAY
+        volume = _sloped(problem, here, free, volume) if is_underway else _expanded(problem, here, free)
         move = (fit(problem.with_volume(volume), here, free.effects).x - here)[free.index]
         # each by itself: one that runs away does not hold the others
         move = np.clip(move, -reach * free.scale, reach * free.scale)
@@ -140,7 +145,8 @@ def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Arou
             if value > height:
                 best, highest, reach = trial, value, reach * _FARTHER if share == 1.0 else _FAR
                 break
-        if highest - height < _ARRIVED:
+        gain = highest - height
+        if gain < _ARRIVED and not is_underway:
             return Mode(here, height, volume, arrived=True)
         here, height = best, highest
     return Mode(here, height, _expanded(problem, here, free), arrived=False)
@@ -173,21 +179,21 @@ class _Volumes:
         problem: whose volume it is.
         x: the point.
         free: what is fitted.
+        tolerance: see `own_mode`.
     """
 
-    def __init__(self, problem: Problem, x: np.ndarray, free: Around) -> None:
-        self._problem = problem
-        there, self.here = _inner(problem, x, _EXACT)
+    def __init__(self, problem: Problem, x: np.ndarray, free: Around, tolerance: float = _EXACT) -> None:
+        self._problem, self._tolerance = problem, tolerance
+        there, self.here = _inner(problem, x, tolerance)
         self._follow = _following(problem.with_volume(None), there, free)
 
     def __call__(self, move: Float[np.ndarray, " shared"]) -> Float[np.ndarray, " cluster"]:
         there, near = self._follow(move)
-        return _inner(self._problem, there, _EXACT, near=near)[1]
+        return _inner(self._problem, there, self._tolerance, near=near)[1]
 
-    def beside(self, step: Float[np.ndarray, " shared"]) -> tuple[np.ndarray, np.ndarray]:
-        """V_c (cluster, shared) a step up and a step down each coordinate."""
-        up, down = (np.stack([self(sign * unit) for unit in np.diag(step)], axis=1) for sign in (1.0, -1.0))
-        return up, down
+    def along(self, step: Float[np.ndarray, " shared"]) -> Float[np.ndarray, "cluster shared"]:
+        """V_c a step along each coordinate."""
+        return np.stack([self(unit) for unit in np.diag(step)], axis=1)
 
 
 def _following(
@@ -222,7 +228,8 @@ def steps(free: Around, joint: Fit) -> Float[np.ndarray, " shared"]:
 
 def beside(problem: Problem, x: np.ndarray, free: Around, step: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """V_c (cluster, shared) a step up and a step down each fitted coordinate."""
-    return _Volumes(problem, x, free).beside(step)
+    volumes = _Volumes(problem, x, free)
+    return volumes.along(step), volumes.along(-step)
 
 
 def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
@@ -235,7 +242,7 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
     at[free.index] = np.maximum(x[free.index], free.lowest + step)
     n, units = len(step), np.diag(step)
     volumes = _Volumes(problem, at, free)
-    middle, (up, down) = volumes.here, volumes.beside(step)
+    middle, up, down = volumes.here, volumes.along(step), volumes.along(-step)
     slope = (up - down) / 2
     bend = (up + down - 2 * middle[:, None])[:, :, None] * np.eye(n)
     ways = (up - middle[:, None], down - middle[:, None])
@@ -246,6 +253,17 @@ def _expanded(problem: Problem, x: np.ndarray, free: Around) -> Volume:
     values, vectors = np.linalg.eigh(bend)
     bend = np.einsum("cij,cj,ckj->cik", vectors, np.minimum(values, 0.0), vectors)
     return Volume(free.index, at[free.index], value, slope / step, bend / np.outer(step, step))
+
+
+def _sloped(problem: Problem, x: np.ndarray, free: Around, near: Volume) -> Volume:
+    """V_c about a point on the way to the mode, by differences to one side; it bends as at the point of another volume."""
+    joint = fit(problem.with_volume(None), x, free.effects, steps=0)
+    step = steps(free, joint)
+    volumes = _Volumes(problem, x, free, _ROUGH)
+    slope = (volumes.along(step) - volumes.here[:, None]) / step
+    slope -= np.einsum("cii->ci", near.bend) * step / 2
+    value, slope = (np.nan_to_num(part, posinf=0.0, neginf=0.0) for part in (volumes.here, slope))
+    return Volume(free.index, x[free.index], value, slope, near.bend)
 
 
 def _bent(

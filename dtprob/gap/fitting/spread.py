@@ -17,6 +17,8 @@ from dtprob.gap.model.problem import Problem
 _FEWEST: Final = 0.5
 _FAINTEST: Final = 1e-9
 """Least standard deviation of a field, as a share of the largest plausible one."""
+_FAINT: Final = 1e-2
+"""The same below which a field that vanishes is at once as faint as can be."""
 _LONGEST: Final = float(np.log(3.0))
 
 type Changes = Mapping[str, float]
@@ -31,7 +33,7 @@ def respread(
     sd^2 <- sum x^2 / gamma, gamma = sum (1 - var / sd^2) the number of entries that the data determine (MacKay, Neural
     Computation 4 (1992) 415): the same fixed point as EM, reached in fewer steps. Where a field is weak these steps
     shrink slowly, so every second one is extrapolated to the limit of a geometric series (Aitken). No step is longer
-    than a factor of 3.
+    than a factor of 3, but for the last one of a field that vanishes.
     """
     spread, changes = dict(active.spread), dict[str, float]()
     own = _variances(problem, active, system)
@@ -43,8 +45,10 @@ def respread(
         step = float(np.log(np.sqrt(np.sum(x[index] ** 2) / determined) / sd + 1e-300))
         shrink = step / latest[name] if latest.get(name) else 0.0
         step = step / (1 - shrink) if 0 < shrink < 1 else step
-        least = _FAINTEST * plausible_spread(effect)
-        spread[name] = max(sd * float(np.exp(np.clip(step, -_LONGEST, _LONGEST))), least)
+        plausible = plausible_spread(effect)
+        longest = np.inf if determined == _FEWEST and sd < _FAINT * plausible else _LONGEST
+        least = _FAINTEST * plausible
+        spread[name] = max(sd * float(np.exp(np.clip(step, -longest, _LONGEST))), least)
         changes[name] = float(np.log(spread[name] / sd))
     change = max(abs(c) for c in changes.values())
     return replace(active, spread=spread), change, {} if latest else changes

@@ -11,7 +11,8 @@ from scipy import optimize
 
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.gap.fitting.integrated import based
-from dtprob.gap.fitting.marginal_mode import around, steps
+from dtprob.gap.fitting import marginal_mode
+from dtprob.gap.fitting.marginal_mode import about_the_mode, around, height_at, steps
 from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -101,6 +102,37 @@ def test_differences_are_taken_within_what_the_data_leave_open():
     assert tight.any()
     np.testing.assert_allclose(step[tight], 0.5 * posterior[tight])
     np.testing.assert_allclose(step[~tight], 0.1 * free.scale[~tight])
+
+
+@pytest.mark.study
+def test_the_mode_is_found_from_far_with_the_volume_expanded_whole_at_both_ends_only(monkeypatch):
+    problem = Problem(levels, readings(3, 1.3), [LOUDER], "device").with_live(["louder"])
+    free = around(problem, ["louder"])
+    far = problem.null()
+    far[free.index] += [2.0, 1.0, -0.5]
+    far, height = height_at(problem, far, free)
+    whole = []
+    expanded = marginal_mode._expanded
+    monkeypatch.setattr(marginal_mode, "_expanded", lambda *given: whole.append(given[1]) or expanded(*given))
+    mode = about_the_mode(problem, far, height, free)
+    assert mode.arrived
+    assert mode.height > height + 400.0
+    (index,) = problem.layout.indices(["louder.log_factor"])
+    there, deviation = exact(readings(3, 1.3))
+    assert mode.x[index] == pytest.approx(there, abs=0.05 * deviation)
+    assert len(whole) == 3  # five rounds
+    np.testing.assert_array_equal(whole[-1], mode.x)
+
+
+@pytest.mark.study
+def test_slopes_by_steps_to_one_side_are_those_of_the_whole_expansion():
+    problem = Problem(levels, readings(3, 1.3), [LOUDER], "device").with_live(["louder"])
+    free = around(problem, ["louder"])
+    x, _ = height_at(problem, problem.null(), free)
+    whole = marginal_mode._expanded(problem, x, free)
+    slope = marginal_mode._sloped(problem, x, free, whole).slope
+    assert np.abs(whole.slope).max() > 0.5
+    np.testing.assert_allclose(slope, whole.slope, atol=0.01)
 
 
 @model(axes={"offset": ("week", "cell"), "y": ("week", "cell")})
