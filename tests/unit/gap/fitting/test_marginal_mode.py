@@ -10,8 +10,8 @@ from numpyro.contrib.control_flow import scan
 from scipy import optimize
 
 from dtprob.effects.effect import Effect, Parameter
-from dtprob.gap.fitting.integrated import based
 from dtprob.gap.fitting import marginal_mode
+from dtprob.gap.fitting.integrated import based
 from dtprob.gap.fitting.marginal_mode import about_the_mode, around, height_at, steps
 from dtprob.gap.fitting.refit import polished, refit, starting_points
 from dtprob.gap.model.problem import Problem
