@@ -130,10 +130,9 @@ def fitted_at(
 
 def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Around) -> Mode:
     """The mode of the marginal density, from a point and the log density there."""
-    reach, gain, volume = _FAR, 0.0, None
+    reach, near = _FAR, None
     for _ in range(_ROUNDS):
-        is_underway = volume is not None and gain > _UNDERWAY
-        volume = _sloped(problem, here, free, volume) if is_underway else _expanded(problem, here, free)
+        volume = _expanded(problem, here, free) if near is None else _sloped(problem, here, free, near)
         move = (fit(problem.with_volume(volume), here, free.effects).x - here)[free.index]
         # each by itself: one that runs away does not hold the others
         move = np.clip(move, -reach * free.scale, reach * free.scale)
@@ -145,9 +144,9 @@ def about_the_mode(problem: Problem, here: np.ndarray, height: float, free: Arou
             if value > height:
                 best, highest, reach = trial, value, reach * _FARTHER if share == 1.0 else _FAR
                 break
-        gain = highest - height
-        if gain < _ARRIVED and not is_underway:
+        if highest - height < _ARRIVED and near is None:
             return Mode(here, height, volume, arrived=True)
+        near = volume if highest - height > _UNDERWAY else None
         here, height = best, highest
     return Mode(here, height, _expanded(problem, here, free), arrived=False)
 
