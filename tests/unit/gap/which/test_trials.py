@@ -30,7 +30,11 @@ def chosen(scores, scans, count, absorbed=(), *, noise=(), promise=1000.0, alarm
     )
     problem = SimpleNamespace(effects=[effect(name) for name in NAMES])
     seen = cast("Any", SimpleNamespace(screening=screening, problem=problem, promise=promise))
-    found = [{n: Found(gain, np.zeros(0), np.zeros(1)) for n, gain in scan.items()} for scan in scans]
+    looks = ("sizes", trials._AT_FIT, "whole effects at the middle")
+    found = {
+        look: {n: Found(gain, np.zeros(0), np.zeros(1)) for n, gain in scan.items()}
+        for look, scan in zip(looks, scans, strict=False)
+    }
     return trials._chosen(seen, found, Settings(candidates=count), None)
 
 
@@ -38,6 +42,17 @@ def test_each_scan_has_its_turn_however_much_another_gains():
     scans = [{"wall": 50.0, "tilt": 40.0, "drift": 30.0}, {"swap": 20.0, "tilt": 10.0}]
     assert chosen({"near": 90.0, "far": 80.0}, scans, 4) == ["near", "wall", "far", "swap"]
     assert chosen({"near": 90.0}, scans, 6) == ["near", "wall", "swap", "tilt", "drift"]
+
+
+def test_the_best_of_each_scan_is_refitted_in_any_case():
+    scans = [{"wall": 50.0, "tilt": 40.0}, {"tilt": 10.0, "swap": 9.0}, {"drift": 5.0, "tilt": 4.0}]
+    assert chosen({"near": 90.0, "far": 80.0}, scans, 2) == ["near", "wall", "tilt", "drift"]
+
+
+def test_whole_effects_have_their_turn_where_the_gap_is_not_large():
+    scores = {"near": 9.0, "far": 8.0, "tilt": 7.0}
+    found = chosen(scores, [{}, {"swap": 30.0, "wall": 20.0}], 4, noise=("near", "far"), promise=60.0)
+    assert found == ["near", "swap", "far", "wall"]
 
 
 def test_what_looks_like_noise_leaves_room_for_what_moves_the_mean():
