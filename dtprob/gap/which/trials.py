@@ -224,8 +224,8 @@ def _chosen(seen: View, scans: Scans, settings: Settings, banned: str | None) ->
 
     One list, where the gap is large, is of those that move what is expected: whatever is wrong looks like noise, which then
     has the largest scores. The other, at the first step, is by the scans, which do not start from the same likelihood, so
-    that their gains cannot be compared: each has its turn. One that nuisances absorb nearly whole is left out unless what is
-    left of it is an alarm.
+    that their gains cannot be compared: each has its turn. One that nuisances absorb nearly whole is left out unless what
+    is left of it is an alarm.
     """
     screening = seen.screening
     at_fit = scans.get(_AT_FIT, {})
