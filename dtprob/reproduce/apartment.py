@@ -46,7 +46,6 @@ RUNS: Final = 1
 SETTINGS: Final = Settings(
     replicates=100,
     site_replicates=19,
-    candidates=6,
     polished=1,
     max_effects=1,
     folds=3,

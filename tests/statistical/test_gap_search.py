@@ -10,6 +10,7 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.effects import Effect, Parameter
+from dtprob.effects.effect import FIELD
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -142,3 +143,28 @@ def test_an_effect_whose_slope_at_its_null_misleads_is_found_beside_another():
     steps = search(problem, fit_base(problem, key), key, SETTINGS, print).steps
     assert steps[0].accepted == "step"
     assert set(steps[-1].view.fitted.effects) == {"step", "turn"}
+
+
+WAVES = np.arange(1, 13)
+MAP = Effect(
+    "map",
+    {
+        "mean": lambda value, p, context: (
+            value + p["scale"] * jnp.sin(jnp.outer(context["x"], WAVES)) @ p[FIELD]
+        )
+    },
+    (Parameter("scale", dist.HalfNormal(1.0)),),
+    kind="variance",
+    field_shape=lambda value, context: (len(WAVES),),
+)
+
+
+def test_what_a_random_field_imitates_is_found_beside_it():
+    """The field was chosen first, takes up all of it, and leaves nothing to see of the other."""
+    weights = 0.35 * np.random.default_rng((1, 9)).normal(size=len(WAVES))
+    data = rows(1, shift=lambda x: 1.6 * np.sin(3 * x) + np.sin(np.outer(x, WAVES)) @ weights)
+    problem, key = Problem(table, data, (*EFFECTS[:2], MAP), "street"), jax.random.key(1)
+    found = search(problem, fit_base(problem, key), key, SETTINGS, print)
+    assert found.steps[0].accepted == "map"
+    assert set(found.steps[-1].view.fitted.effects) == {"one", "map"}
+    assert ("map",) in [rival.fitted.effects for rival in found.rivals]

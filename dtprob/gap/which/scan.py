@@ -9,7 +9,7 @@ while delays and gains stand where the wrong one put them.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import jax
@@ -86,9 +86,7 @@ def scan(
     return found
 
 
-def scan_anew(
-    problem: Problem, x: np.ndarray, names: Sequence[str], begun: Callable[[], None] = lambda: None
-) -> dict[str, Found]:
+def scan_anew(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str, Found]:
     """Effects that gain at their whole size with clusters' own coordinates where they are best then; see `elsewhere`.
 
     Args:
@@ -96,14 +94,12 @@ def scan_anew(
         x: the fit, or the centre of the prior, since the fit may have bent what clusters share to what the twin lacks; it
             stays there.
         names: candidates to look at.
-        begun: called before anything that takes long.
     """
     effects = _means(problem, names)
     by_cluster = problem.compiled.by_cluster
     others = elsewhere(problem, x, by_cluster)
     if not (others and effects):
         return {}
-    begun()
     points = [x, *(point for point, _ in others)]
     here = float(np.fmax.reduce([by_cluster(x), *(terms for _, terms in others)]).sum())
     lines = {

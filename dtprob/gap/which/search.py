@@ -13,6 +13,7 @@ from typing import Final
 import jax
 import numpy as np
 
+from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bound import bound
 from dtprob.gap.fitting.marginal_mode import faithful
@@ -33,6 +34,8 @@ _WITHIN: Final = 0.25
 """Share of what another way gained by which one may fall short of it for its choices to be looked at again."""
 _NEARLY: Final = 3.0
 """Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect."""
+_BESIDE: Final = 4
+"""Fits beside which a random field is fitted once more, at most."""
 _MISSED: Final = 6.0
 """Times what first-order scores promise that a refit may gain."""
 _UNDERSTATED: Final = 0.15
@@ -98,6 +101,14 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
             rest.problem, rest.fitted, key, settings, say, base=base, banned=field, goal=goal, begun=begun
         )
         ways.append([*steps[:-1], *others])
+        reached = max(goal, credit(problem, others[-1].view.fitted, base))
+        both = _beside(others, fields[field], reached, base, settings)
+        if both is not None:
+            key = jax.random.fold_in(key, 3)
+            others = _forward(
+                both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=goal
+            )
+            ways.append([*steps[:-1], *others])
     reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
     pair = _promising(ways, reached - base.log_evidence, settings)
     if pair is not None:
@@ -140,6 +151,32 @@ def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Setting
     enough = max(alone + np.log(len(seen.problem.effects)) + _NEARLY, (1 - _UNDERSTATED) * reached - _NEARLY)
     new = not any(set(best.names) <= end for end in ends)
     return best.names if new and best.log_bayes_factor > enough else None
+
+
+def _beside(
+    steps: Sequence[Step], field: Effect, reached: float, base: fitting.Fit, settings: Settings
+) -> Start | None:
+    """The best refit of a random field beside effects that were found without it, where both promise more than was reached.
+
+    A field that was chosen first leaves nothing to see of the effects that it imitates beside what it is.
+    """
+    promised: dict[tuple[str, ...], tuple[float, View]] = {}
+    for seen in (step.view for step in steps):
+        effects = (*seen.fitted.effects, field.name)
+        if 1 < len(effects) <= settings.max_effects:
+            evidence = seen.fitted.log_evidence + seen.screening.promise_of(field.name)
+            promise = credit(seen.problem, replace(seen.fitted, effects=effects, log_evidence=evidence), base)
+            promised[effects] = promise, seen
+    most = sorted((one for one in promised.values() if one[0] > reached), key=lambda one: -one[0])[:_BESIDE]
+    starts = [_refitted_beside(seen, field) for _, seen in most]
+    return max(starts, key=lambda one: credit(one.problem, one.fitted, base), default=None)
+
+
+def _refitted_beside(seen: View, field: Effect) -> Start:
+    """The fit of a view with a random field beside its effects."""
+    problem = seen.problem.with_live([*seen.fitted.effects, field.name])
+    fitted = replace(seen.fitted, x=problem.translate(seen.fitted.x, seen.problem))
+    return Start(problem, refit(problem, fitted, field, []))
 
 
 def _refitted_with(seen: View, pair: tuple[str, str], settings: Settings) -> Start:

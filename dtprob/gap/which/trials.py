@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -50,8 +49,6 @@ _POLISHED_LATER: Final = 1
 """New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
-_SOME_GAP: Final = 20.0
-"""The same where whole effects with clusters' own unknowns found anew may gain what the scores do not see."""
 _AT_FIT: Final = "whole effects at the fit"
 """What gains there is no move of a nuisance, which the fit would have made."""
 
@@ -117,8 +114,9 @@ def tried(
     """
     screening, fitted = seen.screening, seen.fitted
     scans: Scans = {}
-    if not fitted.effects and seen.promise > _SOME_GAP:
-        scans = _scans(seen, say)
+    if not fitted.effects and seen.promise > _LARGE_GAP:
+        say("scanning the effects' plausible sizes")
+        scans = _scans(seen)
     chosen = [n for n in dict.fromkeys([*_chosen(seen, scans, settings, banned), *earlier]) if n not in known]
     problem = _together(seen.problem, [*fitted.effects, *known, *chosen])
     start = replace(fitted, x=problem.translate(fitted.x, seen.problem))
@@ -139,21 +137,16 @@ def tried(
     return Trials(problem, {name: one for name, one in every.items() if name not in bound(problem, one)})
 
 
-def _scans(seen: View, say: Say) -> Scans:
-    """What far looks find where scores may miss it; of a gap that is not large those at whole effects alone."""
+def _scans(seen: View) -> Scans:
+    """What far looks find where scores may miss it."""
     problem, x, names = seen.problem, seen.fitted.x, seen.screening.names
-    is_large = seen.promise > _LARGE_GAP
-    begun = functools.cache(lambda: say("scanning the effects' plausible sizes"))
-    at_fit = scan_anew(problem, x, names, begun)
-    if not (at_fit or is_large):
-        return {}
     middle = centre(problem, x)
-    anew = {_AT_FIT: at_fit, "whole effects at the middle": scan_anew(problem, middle, names, begun)}
-    if not is_large:
-        return anew
-    begun()
-    sizes = scan(problem, x, names, middle)
-    return {"sizes": sizes, **anew, "sizes of each": scan_each(problem, x, names, middle)}
+    return {
+        "sizes": scan(problem, x, names, middle),
+        _AT_FIT: scan_anew(problem, x, names),
+        "whole effects at the middle": scan_anew(problem, middle, names),
+        "sizes of each": scan_each(problem, x, names, middle),
+    }
 
 
 def _again(problem: Problem, at: Start) -> fitting.Fit:

@@ -49,12 +49,6 @@ def test_the_best_of_each_scan_is_refitted_in_any_case():
     assert chosen({"near": 90.0, "far": 80.0}, scans, 2) == ["near", "wall", "tilt", "drift"]
 
 
-def test_whole_effects_have_their_turn_where_the_gap_is_not_large():
-    scores = {"near": 9.0, "far": 8.0, "tilt": 7.0}
-    found = chosen(scores, [{}, {"swap": 30.0, "wall": 20.0}], 4, noise=("near", "far"), promise=60.0)
-    assert found == ["near", "swap", "far", "wall"]
-
-
 def test_what_looks_like_noise_leaves_room_for_what_moves_the_mean():
     scores = {"near": 90.0, "far": 80.0, "swap": 70.0, "tilt": 8.0, "drift": 6.0}
     noise = ("near", "far", "swap")
