@@ -14,7 +14,7 @@ class Settings:
         replicates: bootstrap replicates of the score statistics.
         site_replicates: bootstrap replicates of the site tests; each costs about one gradient.
         site_times: where a site test comes near its level, up to this many times more replicates decide.
-        candidates: how many effects are refitted in full at each step of the search.
+        candidates: how many effects are refitted in full at each step of the search; what a scan finds best is besides.
         polished: how many of these, and of the fits of the base model, are also freed from local optima of the nuisances;
             beside effects that are fitted at most one.
         max_effects: the largest set of effects that is looked for.

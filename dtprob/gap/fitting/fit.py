@@ -133,9 +133,8 @@ def fit(
         elif trial.gain >= tolerance:
             damping = trial.damping
         change = 0.0
-        if active.spread and (
-            fresh or not is_curved
-        ):  # by one kind of curvature: by the other it would be another one
+        # by curvatures of one kind: by those of the other the spread would be another
+        if active.spread and (fresh or not is_curved):
             active, change, latest = respread(problem, active, x, system, latest)
             value = value_of(problem, active, x)
         converged = converged and change < _SETTLED

@@ -98,7 +98,7 @@ def scan_anew(problem: Problem, x: np.ndarray, names: Sequence[str]) -> dict[str
     effects = _means(problem, names)
     by_cluster = problem.compiled.by_cluster
     others = elsewhere(problem, x, by_cluster)
-    if not (others and effects):
+    if not others:
         return {}
     points = [x, *(point for point, _ in others)]
     here = float(np.fmax.reduce([by_cluster(x), *(terms for _, terms in others)]).sum())

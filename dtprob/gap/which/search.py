@@ -13,7 +13,6 @@ from typing import Final
 import jax
 import numpy as np
 
-from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bound import bound
 from dtprob.gap.fitting.marginal_mode import faithful
@@ -87,7 +86,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         say: receives one line at each stage.
     """
     steps = _forward(problem, base, key, settings, say)
-    end, base = steps[-1].view, steps[0].view.fitted
+    bare, end = steps[0].view, steps[-1].view
+    base = bare.fitted
     ways = [steps]
     fields = {e.name: e for e in problem.effects if e.kind == "variance"}
     field = next((name for name in end.fitted.effects if name in fields), None)
@@ -101,19 +101,18 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
             rest.problem, rest.fitted, key, settings, say, base=base, banned=field, goal=goal, begun=begun
         )
         ways.append([*steps[:-1], *others])
-        reached = max(goal, credit(problem, others[-1].view.fitted, base))
-        both = _beside(others, fields[field], reached, base, settings)
+        both = _beside(others, field, _reached(problem, ways, base), base, settings)
         if both is not None:
             key = jax.random.fold_in(key, 3)
             others = _forward(
                 both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=goal
             )
             ways.append([*steps[:-1], *others])
-    reached = max(credit(problem, way[-1].view.fitted, base) for way in ways)
+    reached = _reached(problem, ways, base)
     pair = _promising(ways, reached - base.log_evidence, settings)
     if pair is not None:
         say(f"starting from {pair[0]} and {pair[1]} together")
-        both = _refitted_with(steps[0].view, pair, settings)
+        both = _refitted_with(bare, pair, settings)
         key = jax.random.fold_in(key, 2)
         if not bound(both.problem, both.fitted):
             others = _forward(
@@ -121,7 +120,6 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
             )
             ways.append([*steps[:-1], *others])
     ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
-    bare = steps[0].view
     if stands_in(bare, ways[0][-1].view, base, field, say):
         ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
@@ -153,8 +151,13 @@ def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Setting
     return best.names if new and best.log_bayes_factor > enough else None
 
 
+def _reached(problem: Problem, ways: Sequence[Sequence[Step]], base: fitting.Fit) -> float:
+    """The most credit that a way ended with."""
+    return max(credit(problem, way[-1].view.fitted, base) for way in ways)
+
+
 def _beside(
-    steps: Sequence[Step], field: Effect, reached: float, base: fitting.Fit, settings: Settings
+    steps: Sequence[Step], field: str, reached: float, base: fitting.Fit, settings: Settings
 ) -> Start | None:
     """The best refit of a random field beside effects that were found without it, where both promise more than was reached.
 
@@ -162,30 +165,23 @@ def _beside(
     """
     promised: dict[tuple[str, ...], tuple[float, View]] = {}
     for seen in (step.view for step in steps):
-        effects = (*seen.fitted.effects, field.name)
+        effects = (*seen.fitted.effects, field)
         if 1 < len(effects) <= settings.max_effects:
-            evidence = seen.fitted.log_evidence + seen.screening.promise_of(field.name)
+            evidence = seen.fitted.log_evidence + seen.screening.promise_of(field)
             promise = credit(seen.problem, replace(seen.fitted, effects=effects, log_evidence=evidence), base)
             promised[effects] = promise, seen
     most = sorted((one for one in promised.values() if one[0] > reached), key=lambda one: -one[0])[:_BESIDE]
-    starts = [_refitted_beside(seen, field) for _, seen in most]
+    starts = [_refitted_with(seen, (field,), settings) for _, seen in most]
     return max(starts, key=lambda one: credit(one.problem, one.fitted, base), default=None)
 
 
-def _refitted_beside(seen: View, field: Effect) -> Start:
-    """The fit of a view with a random field beside its effects."""
-    problem = seen.problem.with_live([*seen.fitted.effects, field.name])
-    fitted = replace(seen.fitted, x=problem.translate(seen.fitted.x, seen.problem))
-    return Start(problem, refit(problem, fitted, field, []))
-
-
-def _refitted_with(seen: View, pair: tuple[str, str], settings: Settings) -> Start:
-    """The base fit with two effects, the second one beside the first and then both together."""
-    problem = seen.problem.with_live(pair)
+def _refitted_with(seen: View, names: Sequence[str], settings: Settings) -> Start:
+    """The fit of a view with further effects, each beside the ones before it, in the end all together."""
+    problem = seen.problem.with_live([*seen.fitted.effects, *names])
     fitted = replace(seen.fitted, x=problem.translate(seen.fitted.x, seen.problem))
     effects = {e.name: e for e in problem.effects}
-    for name in pair:
-        step = seen.screening.step.get(name) if not fitted.effects else None
+    for name in names:
+        step = seen.screening.step.get(name) if fitted.effects == seen.fitted.effects else None
         starts = starting_points(problem, fitted.x, effects[name], step, settings)
         fitted = refit(problem, fitted, effects[name], starts)
     return Start(fitted.within(problem), fitted)

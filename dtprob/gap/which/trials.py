@@ -22,8 +22,6 @@ from dtprob.gap.which.each import scan_each
 from dtprob.gap.which.scan import Found, centre, scan, scan_anew
 
 type Say = Callable[[str], None]
-type Scans = Mapping[str, Mapping[str, Found]]
-"""What each far look found, by the effect."""
 
 _LARGEST_FIELD: Final = 256
 """Entries of a field per cluster up to which it is fitted entry by entry."""
@@ -49,8 +47,9 @@ _POLISHED_LATER: Final = 1
 """New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
-_AT_FIT: Final = "whole effects at the fit"
-"""What gains there is no move of a nuisance, which the fit would have made."""
+_AT_FIT: Final = 1
+"""Which of the scans is that of whole sizes at the fit. What gains there is no move of a nuisance, which the fit would have
+made."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +112,7 @@ def tried(
         earlier: candidates that gained much before; see `remembered`.
     """
     screening, fitted = seen.screening, seen.fitted
-    scans: Scans = {}
+    scans: list[dict[str, Found]] = []
     if not fitted.effects and seen.promise > _LARGE_GAP:
         say("scanning the effects' plausible sizes")
         scans = _scans(seen)
@@ -127,7 +126,7 @@ def tried(
         starts = starting_points(problem, start.x, effects[name], screening.step.get(name), settings)
         starts += [
             _scanned_start(problem, seen.problem, effects[name], found[name])
-            for found in (*scans.values(), earlier)
+            for found in (*scans, earlier)
             if name in found
         ]
         trials[name] = refit(problem, start, effects[name], starts)
@@ -137,16 +136,16 @@ def tried(
     return Trials(problem, {name: one for name, one in every.items() if name not in bound(problem, one)})
 
 
-def _scans(seen: View) -> Scans:
+def _scans(seen: View) -> list[dict[str, Found]]:
     """What far looks find where scores may miss it."""
     problem, x, names = seen.problem, seen.fitted.x, seen.screening.names
     middle = centre(problem, x)
-    return {
-        "sizes": scan(problem, x, names, middle),
-        _AT_FIT: scan_anew(problem, x, names),
-        "whole effects at the middle": scan_anew(problem, middle, names),
-        "sizes of each": scan_each(problem, x, names, middle),
-    }
+    return [
+        scan(problem, x, names, middle),
+        scan_anew(problem, x, names),
+        scan_anew(problem, middle, names),
+        scan_each(problem, x, names, middle),
+    ]
 
 
 def _again(problem: Problem, at: Start) -> fitting.Fit:
@@ -212,16 +211,17 @@ def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Fo
     return x
 
 
-def _chosen(seen: View, scans: Scans, settings: Settings, banned: str | None) -> list[str]:
-    """The best candidates by score, in turn with the best of two other lists, and the best of each scan.
+def _chosen(
+    seen: View, scans: Sequence[Mapping[str, Found]], settings: Settings, banned: str | None
+) -> list[str]:
+    """The best candidates by score; where the gap is large, in turn with the best of two other lists, and each scan's best.
 
-    One list, where the gap is large, is of those that move what is expected: whatever is wrong looks like noise, which then
-    has the largest scores. The other, at the first step, is by the scans, which do not start from the same likelihood, so
-    that their gains cannot be compared: each has its turn. One that nuisances absorb nearly whole is left out unless what
-    is left of it is an alarm.
+    One is of those that move what is expected: whatever is wrong looks like noise, which then has the largest scores. The
+    other, at the first step, is by the scans, which do not start from the same likelihood, so that their gains cannot be
+    compared: each has its turn. One that nuisances absorb nearly whole is left out unless what is left of it is an alarm.
     """
     screening = seen.screening
-    at_fit = scans.get(_AT_FIT, {})
+    at_fit = scans[_AT_FIT] if scans else {}
     able = [
         i
         for i, name in enumerate(screening.names)
@@ -234,15 +234,16 @@ def _chosen(seen: View, scans: Scans, settings: Settings, banned: str | None) ->
         and _affordable(seen.problem, name)
     ]
     by_score = _by_gain(able, screening.log_bayes_factor)
+    if seen.promise <= _LARGE_GAP:
+        return [screening.names[i] for i in by_score[: settings.candidates]]
     ranked = []
-    for found in scans.values():
+    for found in scans:
         gained = {i: found[screening.names[i]].gain for i in able if screening.names[i] in found}
         ranked.append(sorted((i for i in gained if gained[i] > _WORTH), key=lambda i: -gained[i]))
-    locating = [i for i in able if screening.locates[i] and seen.promise > _LARGE_GAP]
-    lists = by_score, _by_gain(locating, screening.log_bayes_factor), _in_turn(*ranked)
+    locating = _by_gain([i for i in able if screening.locates[i]], screening.log_bayes_factor)
+    chosen = _in_turn(by_score, locating, _in_turn(*ranked))[: settings.candidates]
     firsts = [scanned[0] for scanned in ranked if scanned]
-    chosen = dict.fromkeys([*_in_turn(*lists)[: settings.candidates], *firsts])
-    return [screening.names[i] for i in chosen]
+    return [screening.names[i] for i in dict.fromkeys([*chosen, *firsts])]
 
 
 def _by_gain(able: Sequence[int], gain: np.ndarray) -> list[int]:

@@ -63,8 +63,8 @@ def made(monkeypatch):
     return made
 
 
-def fitted(problem, **settings):
-    return fitting.fit(problem, problem.null(), ["extra"], spread={"extra": 1.0}, tolerance=0.03, **settings)
+def fitted(problem):
+    return fitting.fit(problem, problem.null(), ["extra"], spread={"extra": 1.0}, tolerance=0.03)
 
 
 def test_a_step_that_fails_is_tried_shorter_while_the_spread_changes(made):

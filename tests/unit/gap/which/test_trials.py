@@ -30,11 +30,7 @@ def chosen(scores, scans, count, absorbed=(), *, noise=(), promise=1000.0, alarm
     )
     problem = SimpleNamespace(effects=[effect(name) for name in NAMES])
     seen = cast("Any", SimpleNamespace(screening=screening, problem=problem, promise=promise))
-    looks = ("sizes", trials._AT_FIT, "whole effects at the middle")
-    found = {
-        look: {n: Found(gain, np.zeros(0), np.zeros(1)) for n, gain in scan.items()}
-        for look, scan in zip(looks, scans, strict=False)
-    }
+    found = [{n: Found(gain, np.zeros(0), np.zeros(1)) for n, gain in scan.items()} for scan in scans]
     return trials._chosen(seen, found, Settings(candidates=count), None)
 
 
