@@ -135,25 +135,60 @@ def _against_the_others(
     """
     n = len(scores)
     found = _Null(np.zeros(n), np.zeros(n), np.zeros(len(total), bool), np.ones(len(total)))
-    width = max(_AT_ONCE // n, 1)
+    every, width = np.arange(n), max(_AT_ONCE // n, 1)
     for start in range(0, len(total), width):
-        part = slice(start, min(start + width, len(total)))
-        own, whole, counts = scores[:, part] ** 2, total[part], total[part] < np.inf
-        others, fourth = whole - own, (own**2).sum(0)
-        alone = others < _OTHERS * whole
-        if alone.any():
-            own[alone], others[alone] = 0.0, 1.0
-        kurtosis = n * fourth / np.where(counts, whole, 1.0) ** 2
-        found.steady[part] = (kurtosis < _HEAVIEST) & counts
-        found.weight[part] = _weight(kurtosis)
-        beside = (n - 1) * (fourth - own**2) / np.where(counts, others, 1.0) ** 2
-        ratio = own / others
-        capped = np.where(found.steady[part], ratio, np.minimum(ratio, most / (n - 1)))
+        at = slice(start, min(start + width, len(total)))
+        part = _Part.of(scores[:, at] ** 2, total[at])
+        counts = total[at] < np.inf
+        kurtosis = n * part.fourth / np.where(counts, part.total, 1.0) ** 2
+        found.steady[at] = (kurtosis < _HEAVIEST) & counts
+        found.weight[at] = _weight(kurtosis)
+        ratio = part.own / part.others
+        capped = np.minimum(ratio, np.where(found.steady[at], np.inf, most / (n - 1)))
         np.add(found.summed, (capped if most < np.inf else ratio).sum(1), out=found.summed)
-        judged = (beside < _HEAVIEST) & (others > _ALONE * whole) & counts
-        weighed = np.max(ratio * _weight(beside), axis=1, where=judged, initial=0.0)
-        np.maximum(found.largest, weighed, out=found.largest)
+        # weights are at most 1: beside each replicate's largest ratio, few others can weigh more
+        np.maximum(found.largest, part.weighed(every, ratio.argmax(1)), out=found.largest)
+        larger = np.divmod(np.flatnonzero(ratio > found.largest[:, None]), ratio.shape[1])
+        np.maximum.at(found.largest, larger[0], part.weighed(*larger))
     return found
+
+
+class _Part(NamedTuple):
+    """Squared scores (replicate, entry) of a few entries.
+
+    Attributes:
+        own: of each replicate; 0 where the others tell nothing of the entry.
+        others: sum over the other replicates; 1 where they tell nothing.
+        fourth: sum of the squares of `own` over replicates, (entry,), before any was set to 0.
+        total: sum over replicates, infinite where an entry does not count, (entry,).
+    """
+
+    own: Float[np.ndarray, "replicate entry"]
+    others: Float[np.ndarray, "replicate entry"]
+    fourth: Float[np.ndarray, " entry"]
+    total: Float[np.ndarray, " entry"]
+
+    @classmethod
+    def of(cls, own: np.ndarray, total: np.ndarray) -> _Part:
+        """From all squares; sets those to 0 that are alone."""
+        fourth, others = np.einsum("ne,ne->e", own, own), total - own
+        lone = np.flatnonzero(others.min(0) < _OTHERS * total)
+        if len(lone):
+            alone = others[:, lone] < _OTHERS * total[lone]
+            own[:, lone], others[:, lone] = (
+                np.where(alone, 0.0, own[:, lone]),
+                np.where(alone, 1.0, others[:, lone]),
+            )
+        return cls(own, others, fourth, total)
+
+    def weighed(self, replicate: np.ndarray, entry: np.ndarray) -> np.ndarray:
+        """Ratios of own squares to the others', weighed by the kurtosis in these; 0 where they are no judges."""
+        own, others = self.own[replicate, entry], self.others[replicate, entry]
+        total, n = self.total[entry], len(self.own)
+        counts = total < np.inf
+        beside = (n - 1) * (self.fourth[entry] - own**2) / np.where(counts, others, 1.0) ** 2
+        judged = (beside < _HEAVIEST) & (others > _ALONE * total) & counts
+        return np.where(judged, own / others * _weight(beside), 0.0)
 
 
 def _weight(kurtosis: np.ndarray) -> np.ndarray:
