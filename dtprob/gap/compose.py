@@ -81,9 +81,9 @@ def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence, *, tole
     name = " and ".join(best.effects) if best else ""
     closed_part = ""
     if best is not None and best.closed_fraction is not None:
-        c = best.closed_fraction
+        c, verb = best.closed_fraction, "close" if len(best.effects) > 1 else "closes"
         closed_part = (
-            f", which closes {100 * c.mean:.0f}% of the gap ({100 * c.low:.0f} to {100 * c.high:.0f}%)"
+            f", which {verb} {100 * c.mean:.0f}% of the gap ({100 * c.low:.0f} to {100 * c.high:.0f}%)"
         )
     match verdict:
         case "NO_GAP":

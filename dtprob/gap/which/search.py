@@ -15,12 +15,12 @@ import numpy as np
 
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bound import bound
-from dtprob.gap.fitting.marginal_mode import faithful
-from dtprob.gap.fitting.refit import BETTER, at_null_except, refit, starting_points, without
+from dtprob.gap.fitting.refit import BETTER, without
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View, view
 from dtprob.gap.which.stand_in import stands_in
+from dtprob.gap.which.starts import beside, promising, refitted_with, refitted_without
 from dtprob.gap.which.trials import Say, Start, Trials, best, credit, remembered, tried
 
 _RETURNS: Final = 3
@@ -31,14 +31,8 @@ _REVISED: Final = 5
 """Effects that are refitted in full where an earlier choice is looked at again, beside that choice, at most."""
 _WITHIN: Final = 0.25
 """Share of what another way gained by which one may fall short of it for its choices to be looked at again."""
-_NEARLY: Final = 3.0
-"""Nats by which a pair may promise less than was reached, and by which it has to promise more than one effect."""
-_BESIDE: Final = 4
-"""Fits beside which a random field is fitted once more, at most."""
 _MISSED: Final = 6.0
 """Times what first-order scores promise that a refit may gain."""
-_UNDERSTATED: Final = 0.15
-"""Share of a gain that first-order scores may miss."""
 
 
 @dataclass(frozen=True)
@@ -93,7 +87,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     field = next((name for name in end.fitted.effects if name in fields), None)
     if field is not None and not fields[field].is_looked_for:
         say(f"looking for effects that {field} may have imitated")
-        rest = _refitted_without(end.problem, end.fitted, field)
+        rest = refitted_without(end.problem, end.fitted, field)
         key = jax.random.fold_in(key, 1)
         goal = credit(problem, end.fitted, base)
         begun = _without_trial(steps[0], rest.fitted, field)
@@ -101,7 +95,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
             rest.problem, rest.fitted, key, settings, say, base=base, banned=field, goal=goal, begun=begun
         )
         ways.append([*steps[:-1], *others])
-        both = _beside(others, field, _reached(problem, ways, base), base, settings)
+        both = beside([step.view for step in others], field, _reached(problem, ways, base), base, settings)
         if both is not None:
             key = jax.random.fold_in(key, 3)
             others = _forward(
@@ -109,10 +103,10 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
             )
             ways.append([*steps[:-1], *others])
     reached = _reached(problem, ways, base)
-    pair = _promising(ways, reached - base.log_evidence, settings)
+    pair = promising(bare, [way[-1].view for way in ways], reached - base.log_evidence, settings)
     if pair is not None:
         say(f"starting from {pair[0]} and {pair[1]} together")
-        both = _refitted_with(bare, pair, settings)
+        both = refitted_with(bare, pair, settings)
         key = jax.random.fold_in(key, 2)
         if not bound(both.problem, both.fitted):
             others = _forward(
@@ -126,65 +120,9 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
 
 
-def _promising(ways: Sequence[Sequence[Step]], reached: float, settings: Settings) -> tuple[str, str] | None:
-    """The pair that promises most to first order, if it promises more than one effect, and as much as was reached.
-
-    None where a way ended with it. First order understates: the base fit's spread holds the gap too. It overstates what
-    noise explains, as which all of the gap counts at first: where what moves the mean leaves nothing, noise is no start.
-    """
-    seen = ways[0][0].view
-    ends = [set(way[-1].view.fitted.effects) for way in ways]
-    if settings.max_effects < 2 or not any(ends):
-        return None
-    pairs = seen.screening.scores.pairs()
-    locating = seen.screening.scores.locating
-    if any(
-        end <= locating and not way[-1].view.alarmed(settings) for end, way in zip(ends, ways, strict=True)
-    ):
-        pairs = tuple(pair for pair in pairs if locating.issuperset(pair.names))
-    if not pairs:
-        return None
-    best = pairs[0]
-    alone = float(seen.screening.scores.log_bayes_factor.max())
-    enough = max(alone + np.log(len(seen.problem.effects)) + _NEARLY, (1 - _UNDERSTATED) * reached - _NEARLY)
-    new = not any(set(best.names) <= end for end in ends)
-    return best.names if new and best.log_bayes_factor > enough else None
-
-
 def _reached(problem: Problem, ways: Sequence[Sequence[Step]], base: fitting.Fit) -> float:
     """The most credit that a way ended with."""
     return max(credit(problem, way[-1].view.fitted, base) for way in ways)
-
-
-def _beside(
-    steps: Sequence[Step], field: str, reached: float, base: fitting.Fit, settings: Settings
-) -> Start | None:
-    """The best refit of a random field beside effects that were found without it, where both promise more than was reached.
-
-    A field that was chosen first leaves nothing to see of the effects that it imitates beside what it is.
-    """
-    promised: dict[tuple[str, ...], tuple[float, View]] = {}
-    for seen in (step.view for step in steps):
-        effects = (*seen.fitted.effects, field)
-        if 1 < len(effects) <= settings.max_effects:
-            evidence = seen.fitted.log_evidence + seen.screening.promise_of(field)
-            promise = credit(seen.problem, replace(seen.fitted, effects=effects, log_evidence=evidence), base)
-            promised[effects] = promise, seen
-    most = sorted((one for one in promised.values() if one[0] > reached), key=lambda one: -one[0])[:_BESIDE]
-    starts = [_refitted_with(seen, (field,), settings) for _, seen in most]
-    return max(starts, key=lambda one: credit(one.problem, one.fitted, base), default=None)
-
-
-def _refitted_with(seen: View, names: Sequence[str], settings: Settings) -> Start:
-    """The fit of a view with further effects, each beside the ones before it, in the end all together."""
-    problem = seen.problem.with_live([*seen.fitted.effects, *names])
-    fitted = replace(seen.fitted, x=problem.translate(seen.fitted.x, seen.problem))
-    effects = {e.name: e for e in problem.effects}
-    for name in names:
-        step = seen.screening.step.get(name) if fitted.effects == seen.fitted.effects else None
-        starts = starting_points(problem, fitted.x, effects[name], step, settings)
-        fitted = refit(problem, fitted, effects[name], starts)
-    return Start(fitted.within(problem), fitted)
 
 
 def _forward(
@@ -303,7 +241,7 @@ def _revised(
         left_out = next((e for e in chosen if frozenset(chosen) - {e} not in looked), None)
         if left_out is None:
             return
-        rest = _refitted_without(reached.problem, reached.fitted, left_out)
+        rest = refitted_without(reached.problem, reached.fitted, left_out)
         looked.add(frozenset(rest.fitted.effects))
         again = jax.random.fold_in(key, i)
         # chosen by scores alone
@@ -311,11 +249,3 @@ def _revised(
         trials = tried(seen, settings, say, {left_out: reached}, banned=banned)
         last = Step(seen, trials, best(seen, base, trials.fits, settings))
         yield last
-
-
-def _refitted_without(problem: Problem, fitted: fitting.Fit, name: str) -> Start:
-    """The fit with all its effects but one."""
-    others = tuple(e for e in fitted.effects if e != name)
-    x = at_null_except(problem, fitted, others)
-    found = faithful(problem, fitting.fit(problem, x, others, spread=fitted.spread), [x])
-    return Start(found.within(problem), found)

@@ -36,6 +36,17 @@ def test_effects_that_were_not_looked_for_any_more_are_said():
     )
 
 
+@pytest.mark.parametrize(
+    ("effects", "said"), [(("a",), "a, which closes"), (("a", "b"), "a and b, which close")]
+)
+def test_what_is_named_closes_a_share(effects, said):
+    closed = SimpleNamespace(mean=0.9, low=0.8, high=0.95)
+    cause = SimpleNamespace(effects=effects, alias_class=(effects,), closed_fraction=closed)
+    assert summary("LISTED", (cause,), SimpleNamespace()) == (
+        f"The gap comes from {said} 90% of the gap (80 to 95%)."
+    )
+
+
 def test_a_gap_within_the_tolerance_is_a_gap():
     assert summary("NO_GAP", (), SimpleNamespace(), tolerated=True).startswith("A gap was found")
     assert summary("NO_GAP", (), SimpleNamespace()).startswith("No gap was found")
