@@ -267,15 +267,21 @@ class Compiled:
         """
 
         @jax.jit
-        def prior(x: Any, basis: jax.Array, weights: Any, arrays: Any) -> tuple[jax.Array, jax.Array]:
+        def prior(
+            x: Any, basis: jax.Array, count: Any, weights: Any, arrays: Any
+        ) -> tuple[jax.Array, jax.Array]:
             slope, push = jax.linearize(lambda y: jax.grad(self._runner.log_prior)(y, weights, arrays), x)
-            return slope, -jax.vmap(push)(basis)
+
+            def put(i: Any, into: jax.Array) -> jax.Array:
+                return into.at[i].set(-push(basis[i]))
+
+            return slope, jax.lax.fori_loop(0, count, put, jnp.zeros_like(basis))
 
         def chunked(
             x: np.ndarray, basis: np.ndarray, weights: np.ndarray | None = None
         ) -> tuple[np.ndarray, np.ndarray]:
             given = jnp.ones(self._runner.rows.n_cluster) if weights is None else jnp.asarray(weights, float)
-            parts = [prior(jnp.asarray(x), chunk, given, self.arrays) for chunk, _ in chunks(basis)]
+            parts = [prior(jnp.asarray(x), *chunk, given, self.arrays) for chunk in chunks(basis)]
             return np.asarray(parts[0][0]), np.concatenate([c for _, c in parts])[: len(basis)]
 
         return chunked
