@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -75,35 +75,67 @@ _ALIKE: Final = 1e-9
 """Spread over mean up to which replicates are alike."""
 
 
+class Moments(NamedTuple):
+    """Mean, variance and third central moment of what each value is compared with."""
+
+    mean: np.ndarray
+    variance: np.ndarray
+    third: np.ndarray
+
+    @property
+    def is_too_skew(self) -> np.ndarray:
+        """Whether it is more skew than a Gumbel variable, or all alike but for rounding."""
+        spread = np.sqrt(self.variance)
+        return (spread <= _ALIKE * np.abs(self.mean)) | (self.third >= _MOST_SKEW * spread**3)
+
+
+def moments_of_others(values: np.ndarray) -> Moments:
+    """Moments of the replicates that each of the values (replicate + 1,) is compared with, those of the data being last.
+
+    A replicate is compared with the others, as the data are with all: judged by moments that it is part of, none could be
+    as far out as the data can.
+    """
+    n = len(values) - 1
+    centred = values[:-1] - values[:-1].mean()
+    count, own = np.append(np.full(n, max(n - 1, 1)), n), np.append(centred, 0.0)
+    first, second, third = ((np.sum(centred**k) - own**k) / count for k in (1, 2, 3))
+    variance = np.maximum(second - first**2, 0.0)
+    return Moments(values[:-1].mean() + first, variance, third - 3 * first * second + 2 * first**3)
+
+
 def largest_tail(largest: np.ndarray) -> np.ndarray:
-    """Upper-tail p-values of the largest of many squared scores over variances: of replicates, and of the data, last."""
-    return beyond_largest(largest, largest[:-1])
+    """Upper-tail p-values of the largest of many squared scores over variances: of replicates, and of the data, last.
+
+    They are taken as Gumbel, which the largest square of many normal scores is; where the replicates are more skew, their
+    roots are. Where these are, too, as of rare outcomes, or all alike, nothing is said.
+    """
+    found = np.ones_like(largest)
+    for values in (np.sqrt(largest), largest):
+        others = moments_of_others(values)
+        tail = _gumbel_tail(values, others.mean, np.sqrt(others.variance))
+        found = np.where(others.is_too_skew, found, tail)
+    return found
 
 
 def beyond_largest(values: np.ndarray, null: np.ndarray) -> np.ndarray:
-    """Upper-tail p-values of values, each the largest of many, against those of replicates.
+    """Upper-tail p-values of values, each the largest of many, against those of replicates; as in `largest_tail`."""
+    for seen, replicates in ((values, null), (np.sqrt(values), np.sqrt(null))):
+        found = Moments(*(moment[-1] for moment in moments_of_others(np.append(replicates, 0.0))))
+        if not found.is_too_skew:
+            return _gumbel_tail(seen, found.mean, np.sqrt(found.variance))
+    return np.ones_like(values)
 
-    The replicates' own are taken as Gumbel, which the largest square of many normal scores is; where they are more skew,
-    their roots are. Where these are, too, as of rare outcomes, or all alike, nothing is said.
-    """
-    if _is_too_skew(null):
-        values, null = np.sqrt(values), np.sqrt(null)
-    if _is_too_skew(null):
-        return np.ones_like(values)
-    scale = max(float(null.std()) * np.sqrt(6.0) / np.pi, 1e-12)
-    log_rate = -(values - float(null.mean())) / scale - np.euler_gamma
+
+def _gumbel_tail(values: np.ndarray, mean: np.ndarray, spread: np.ndarray) -> np.ndarray:
+    """Upper-tail p-values of Gumbel variables of a mean and a standard deviation."""
+    scale = np.maximum(spread * np.sqrt(6.0) / np.pi, 1e-12)
+    log_rate = -(values - mean) / scale - np.euler_gamma
     return np.maximum(-np.expm1(-np.exp(np.minimum(log_rate, 30.0))), np.exp(LOG_SMALLEST))
 
 
-def _is_too_skew(null: np.ndarray) -> bool:
-    """Whether it is more skew than a Gumbel variable, or all alike but for rounding."""
-    mean = null.mean()
-    centred = null - mean
-    spread = np.sqrt(np.mean(centred**2))
-    return bool(spread <= _ALIKE * abs(mean) or np.mean(centred**3) >= _MOST_SKEW * spread**3)
-
-
-def variance_ratio_tail(observed: np.ndarray, mean: float, variance: float, replicates: int) -> np.ndarray:
+def variance_ratio_tail(
+    observed: np.ndarray, mean: ArrayLike, variance: ArrayLike, replicates: int
+) -> np.ndarray:
     """Upper-tail p-values of sums of squares, each over its variance in so many replicates: an F distribution.
 
     Args:
@@ -112,8 +144,9 @@ def variance_ratio_tail(observed: np.ndarray, mean: float, variance: float, repl
         variance: likewise; with the mean it tells how many independent squares there are.
         replicates: from which the variance of each square was taken.
     """
-    squares = 2 * mean**2 / max(variance, 1e-12 * mean**2)
-    p = special.fdtrc(squares, replicates * max(squares, 1.0), observed / mean)
+    mean = np.asarray(mean)
+    squares = 2 * mean**2 / np.maximum(variance, 1e-12 * mean**2)
+    p = special.fdtrc(squares, replicates * np.maximum(squares, 1.0), observed / mean)
     return np.maximum(p, np.exp(LOG_SMALLEST))
 
 

@@ -7,7 +7,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from dtprob.gap.tails import largest_tail, variance_ratio_tail
+from dtprob.gap.tails import largest_tail, moments_of_others, variance_ratio_tail
 from dtprob.gap.where.families import Family
 
 CHANCE: Final = 8
@@ -95,9 +95,9 @@ def family_test(family: Family, scores: np.ndarray, normal: np.ndarray | None = 
     summed, largest, steady, weight = _against_the_others(scores[1:], np.where(alive, total, np.inf), most)
     statistic, own = (n - 1) * summed, scores[0, alive] ** 2 / total[alive]
     counted = np.where(steady[alive], own, np.minimum(own, most / n))
-    p = variance_ratio_tail(
-        np.append(statistic, n * counted.sum()), float(statistic.mean()), float(statistic.var()), n - 1
-    )
+    sums = np.append(statistic, n * counted.sum())
+    others = moments_of_others(sums)
+    p = variance_ratio_tail(sums, others.mean, others.variance, n - 1)
     if steady.sum() >= max(_SEVERAL, _MOSTLY * alive.sum()):
         weighed = np.minimum(own[steady[alive]], 1 / _ALONE - 1) * weight[steady]
         p = np.minimum(p, largest_tail(np.append((n - 1) * largest, n * weighed.max())))

@@ -40,7 +40,7 @@ _ALL_SPREAD: Final = 0.999
 """Share of what a site moves that lies in spreads where it moves nothing else."""
 _MORE: Final = 400
 """Replicates of a second look at the sites, at least; a third one takes all that the settings allow."""
-_OPEN_AT_FIRST: Final = (1e-9, 0.1)
+_OPEN_AT_FIRST: Final = (1e-9, 0.5)
 """Between these, a first look does not tell on which side of the level a gap lies; of outcomes and counts not below."""
 _OPEN_WHERE_SHOWN: Final = (1e-6, 0.1)
 """The same where the effects' scores show the gap, and the sites say mostly where it lies."""

@@ -38,6 +38,14 @@ def test_p_values_where_nothing_is_wrong(entries):
     assert (null <= 0.01).mean() <= 0.025
 
 
+@pytest.mark.parametrize("entries", [4, 40])
+def test_replicates_are_as_often_far_out_as_data_where_nothing_is_wrong(entries):
+    """Among thousands of families it is the far tail that is compared; one time in a thousand each."""
+    found = [p_of(0.0, seed, entries) for seed in range(3000)]
+    often = np.mean([test.null <= 2e-3 for test in found])
+    assert sum(test.p_value <= 2e-3 for test in found) <= stats.binom.isf(1e-3, 3000, often)
+
+
 def test_stretches_are_sums_over_windows():
     (found,) = stretches(20, "hour")
     values = np.arange(20.0)

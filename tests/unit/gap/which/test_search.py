@@ -1,4 +1,4 @@
-"""From which pair a search starts once more."""
+"""Steps of a search: where they end, which are taken over, when earlier choices are looked at again."""
 
 from types import SimpleNamespace
 
@@ -8,47 +8,7 @@ import pytest
 
 from dtprob.gap.settings import Settings
 from dtprob.gap.which import search
-from dtprob.gap.which.pairs import Pair
-from dtprob.gap.which.search import _promising
 from dtprob.gap.which.trials import Trials
-
-TILT_AND_NOISE, TILT_AND_SHIFT = Pair(("noise", "tilt"), 900.0), Pair(("shift", "tilt"), 880.0)
-
-
-def way(effects, *, leaves, pairs=(TILT_AND_NOISE, TILT_AND_SHIFT)):
-    """A way of one step that ended with these effects; noise alone moves no mean."""
-    scores = SimpleNamespace(
-        pairs=lambda: pairs,
-        locating=frozenset({"shift", "tilt", "gain"}),
-        log_bayes_factor=np.array([700.0, 500.0]),
-    )
-    view = SimpleNamespace(
-        problem=SimpleNamespace(effects=("shift", "tilt", "gain", "noise")),
-        fitted=SimpleNamespace(effects=effects),
-        screening=SimpleNamespace(scores=scores),
-        alarmed=lambda _: leaves,
-    )
-    return [SimpleNamespace(view=view)]
-
-
-def test_noise_is_no_start_where_what_moves_the_mean_leaves_nothing():
-    assert _promising([way(("gain",), leaves=False)], 800.0, Settings()) == ("shift", "tilt")
-    only_noise = way(("gain",), leaves=False, pairs=(TILT_AND_NOISE,))
-    assert _promising([only_noise], 800.0, Settings()) is None
-
-
-@pytest.mark.parametrize(("effects", "leaves"), [(("gain",), True), (("noise",), False)])
-def test_noise_is_a_start_where_something_is_left_or_noise_was_needed(effects, leaves):
-    assert _promising([way(effects, leaves=leaves)], 800.0, Settings()) == ("noise", "tilt")
-
-
-@pytest.mark.parametrize(("effects", "reached"), [(("noise", "tilt"), 800.0), (("gain",), 1500.0), ((), 0.0)])
-def test_no_pair_that_was_reached_or_promises_less_or_where_nothing_was_found(effects, reached):
-    assert _promising([way(effects, leaves=True)], reached, Settings()) is None
-
-
-def test_no_pair_where_one_effect_is_all_that_is_looked_for():
-    assert _promising([way(("gain",), leaves=True)], 800.0, Settings(max_effects=1)) is None
 
 
 def test_a_search_that_goes_in_a_circle_ends_where_most_credit_is(monkeypatch):
