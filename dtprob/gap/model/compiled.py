@@ -13,6 +13,7 @@ import numpy as np
 
 from dtprob.gap.model.bend import bending
 from dtprob.gap.model.misses import Miss, misses
+from dtprob.gap.model.one_by_one import one_by_one
 from dtprob.gap.model.quick import Adaptive, quick_jit
 from dtprob.gap.model.rows import stacked
 from dtprob.gap.model.running import Arrays, Outcome, Runner
@@ -58,12 +59,9 @@ class Compiled:
 
         @jax.jit
         def many(xs: jax.Array, count: Any, arrays: Arrays) -> Terms:
-            def put(i: Any, into: Terms) -> Terms:
-                return jax.tree.map(lambda all_, new: all_.at[i].set(new), into, self.terms(xs[i], arrays))
-
             shapes = jax.eval_shape(self.terms, xs[0], arrays)
             nothing = jax.tree.map(lambda s: jnp.zeros((len(xs), *s.shape), s.dtype), shapes)
-            return jax.lax.fori_loop(0, count, put, nothing)
+            return one_by_one(lambda i: self.terms(xs[i], arrays), count, nothing)
 
         def padded(xs: np.ndarray) -> Terms:
             whole = np.zeros((_POINTS, xs.shape[1]))
@@ -123,10 +121,10 @@ class Compiled:
                 own = jnp.where(weights > 0, found.likelihood + found.local, 0.0)
                 return found.prior + jnp.sum(weights * own)
 
-            def put(i: Any, into: jax.Array) -> jax.Array:
-                return into.at[i].set(-jax.jvp(jax.grad(total), (x,), (basis[i],))[1])
+            def along(i: Any) -> jax.Array:
+                return -jax.jvp(jax.grad(total), (x,), (basis[i],))[1]
 
-            return jax.lax.fori_loop(0, count, put, jnp.zeros_like(basis))
+            return one_by_one(along, count, jnp.zeros_like(basis))
 
         def chunked(x: np.ndarray, weights: np.ndarray, basis: np.ndarray) -> np.ndarray:
             given = jnp.asarray(x), jnp.asarray(weights, float)
@@ -208,11 +206,11 @@ class Compiled:
 
         @jax.jit
         def shifted(x: Any, deltas: dict[str, jax.Array], count: Any, arrays: Any) -> jax.Array:
-            def put(i: Any, into: jax.Array) -> jax.Array:
+            def perturbed(i: Any) -> jax.Array:
                 found = self._terms(self._runner.run(x, arrays, {n: delta[i] for n, delta in deltas.items()}))
-                return into.at[i].set(found.likelihood + found.local)
+                return found.likelihood + found.local
 
-            return jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, self._runner.rows.n_cluster)))
+            return one_by_one(perturbed, count, jnp.zeros((CHUNK, self._runner.rows.n_cluster)))
 
         def chunked(x: np.ndarray, deltas: Mapping[str, Any], n: int) -> np.ndarray:
             chunks = zip(range(n, 0, -CHUNK), self._padded(deltas, n), strict=True)
@@ -271,11 +269,7 @@ class Compiled:
             x: Any, basis: jax.Array, count: Any, weights: Any, arrays: Any
         ) -> tuple[jax.Array, jax.Array]:
             slope, push = jax.linearize(lambda y: jax.grad(self._runner.log_prior)(y, weights, arrays), x)
-
-            def put(i: Any, into: jax.Array) -> jax.Array:
-                return into.at[i].set(-push(basis[i]))
-
-            return slope, jax.lax.fori_loop(0, count, put, jnp.zeros_like(basis))
+            return slope, one_by_one(lambda i: -push(basis[i]), count, jnp.zeros_like(basis))
 
         def chunked(
             x: np.ndarray, basis: np.ndarray, weights: np.ndarray | None = None

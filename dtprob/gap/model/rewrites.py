@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from dtprob.effects.effect import FIELD, Context, Effect
+from dtprob.gap.model.one_by_one import one_by_one
 
 _PLACES: Final = 96
 """Places of an effect whose tangents are held at once."""
@@ -77,18 +78,15 @@ def trial_shifts(
 ) -> dict[str, jax.Array]:
     """Rewritten sites less their values (trial, *site) at the first of flat parameters (trial, n), zero at others."""
 
-    def one(flat: jax.Array) -> dict[str, jax.Array]:
-        parameters, result = unflatten(effect, flat), {}
+    def one(i: jax.Array) -> dict[str, jax.Array]:
+        parameters, result = unflatten(effect, sizes[i]), {}
         for site, rewrite in effect.rewrites.items():
             new = jnp.asarray(rewrite(values[site], parameters, context)).astype(values[site].dtype)
             result[site] = new - values[site]
         return result
 
-    def put(i: jax.Array, into: dict[str, jax.Array]) -> dict[str, jax.Array]:
-        return jax.tree.map(lambda all_, new: all_.at[i].set(new), into, one(sizes[i]))
-
     nothing = {s: jnp.zeros((len(sizes), *values[s].shape), values[s].dtype) for s in effect.rewrites}
-    return jax.lax.fori_loop(0, count, put, nothing)
+    return one_by_one(one, count, nothing)
 
 
 def field_shifts(

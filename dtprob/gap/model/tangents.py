@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from dtprob.gap.model.one_by_one import one_by_one
 from dtprob.gap.model.running import Arrays, Runner
 from dtprob.gap.observation import whiten
 
@@ -91,15 +92,12 @@ class Tangents:
             rows = {n: whiten.about(o) for n, o in runner.around(here).items()}
             residual = {n: row.residual(values[n]) for n, row in rows.items()}
 
-            def shifted(direction: jax.Array) -> jax.Array:
-                tangent = push(taken(direction))
+            def shifted(i: Any) -> jax.Array:
+                tangent = push(taken(basis[i]))
                 return runner.rows.stack({n: row.shift(tangent[n]) for n, row in rows.items()})
 
-            def put(i: Any, into: jax.Array) -> jax.Array:  # at once they would not fit in a CPU's cache
-                return into.at[i].set(shifted(basis[i]))
-
-            one = jax.eval_shape(shifted, basis[0])
-            columns = jax.lax.fori_loop(0, count, put, jnp.zeros((CHUNK, *one.shape), one.dtype))
+            one = jax.eval_shape(shifted, 0)
+            columns = one_by_one(shifted, count, jnp.zeros((CHUNK, *one.shape), one.dtype))
             return runner.rows.stack(residual), jnp.moveaxis(columns, 0, -1)
 
         def chunked(x: np.ndarray, basis: np.ndarray, arrays: Arrays) -> tuple[jax.Array, jax.Array]:

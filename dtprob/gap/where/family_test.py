@@ -145,7 +145,7 @@ def _against_the_others(
         found.weight[at] = _weight(kurtosis)
         ratio = part.own / part.others
         capped = np.minimum(ratio, np.where(found.steady[at], np.inf, most / (n - 1)))
-        np.add(found.summed, (capped if most < np.inf else ratio).sum(1), out=found.summed)
+        np.add(found.summed, capped.sum(1), out=found.summed)
         # weights are at most 1: beside each replicate's largest ratio, few others can weigh more
         np.maximum(found.largest, part.weighed(every, ratio.argmax(1)), out=found.largest)
         larger = np.divmod(np.flatnonzero(ratio > found.largest[:, None]), ratio.shape[1])
