@@ -17,7 +17,7 @@ def looks(first, affordable, *, shown=False, discrete=False, **settings):
 def test_a_second_look_is_of_four_hundred_and_a_third_of_all():
     (second, open_at_first), (third, open_at_second) = looks(99, 1000)
     assert (second, third) == (5, 20)
-    assert open_at_first == (1e-9, 0.1)
+    assert open_at_first == (1e-9, 0.5)
     assert open_at_second == pytest.approx((5e-5, 0.05))
 
 
