@@ -18,7 +18,7 @@ from dtprob.report.units import (
     with_unit,
 )
 
-_MOMENTS: Final = ("spread", "shape", "skewness", "tails", "circularity", "dependence")
+_MOMENTS: Final = ("spread", "shape", "skewness", "tails", "circularity", "dependence", "repeats")
 """What of observations may be wrong where their values are right."""
 _CAPITALS = {
     "iq": "I/Q",

@@ -75,8 +75,14 @@ def next_look(report: Report) -> str:
 
 def changed(sites: Sequence[Site]) -> str:
     """`change the path delays and cause the dependence of the delay on RSS`."""
-    verbs = ("cause" if (moment(site) or "").startswith("dependence") else "change" for site in sites)
-    return listing(f"{verb} the {located_words(site)}" for verb, site in zip(verbs, sites, strict=True))
+    return listing(map(_changed, sites))
+
+
+def _changed(site: Site) -> str:
+    what = (moment(site) or "values").partition(" ")[0]
+    verb = "cause" if what in ("dependence", "repeats") else "change"
+    such = " (a receiver at its limit, a sensor that is stuck, a default where nothing was measured)"
+    return f"{verb} the {located_words(site)}{such * (what == 'repeats')}"
 
 
 def _saved(plan: Mapping[str, Any]) -> str:

@@ -33,6 +33,7 @@ from dtprob.gap.where.foremost import foremost
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.moments import further_moments
 from dtprob.gap.where.quantities import Quantity, cells, groups, quantity, together
+from dtprob.gap.where.repeats import repeats
 from dtprob.gap.where.site_finding import SURE, SiteFinding, rank, shadows_last
 from dtprob.gap.where.suspects import Suspect, plainest, suspects
 
@@ -146,12 +147,14 @@ class _Ways(NamedTuple):
         along: curves along their axes.
         over: curves over quantities.
         normal: normal rows and site gradients, of the replicates' covariance, of outcomes and counts; else None.
+        repeated: observations of which one value is read too often.
     """
 
     values: Mapping[str, np.ndarray]
     along: Along
     over: Over
     normal: tuple[np.ndarray, Mapping[str, np.ndarray]] | None
+    repeated: Sequence[SiteFinding]
 
 
 def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
@@ -167,7 +170,8 @@ def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
         for q, found in together(axes, shape, given)
     ]
     discrete = any(is_discrete(family) for family in problem.families.values())
-    return _Ways(values, along, over, normal_like(drawn) if discrete else None)
+    normal = normal_like(drawn) if discrete else None
+    return _Ways(values, along, over, normal, tuple(repeats(problem, x)))
 
 
 def _test_sites(
@@ -197,7 +201,8 @@ def _test_sites(
         _finding(problem, fitted, projection, drawn, site=site, tests=tests, smallest=smallest)
         for site, tests in tested
     ]
-    return _Tested(tested, findings, [_beyond(name, tests, smallest) for name, tests in beyond.items()])
+    further = [_beyond(name, tests, smallest) for name, tests in beyond.items()]
+    return _Tested(tested, findings, [*further, *ways.repeated])
 
 
 def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Quantity]:

@@ -37,7 +37,7 @@ _LONG: Final = 8
 """Positions of an axis from which on that is looked at."""
 _MOST_PAIRS: Final = 4096
 """Pairs of components and outputs up to which each is."""
-_MOMENTS: Final = ("spread", "shape", "skewness", "tails", "circularity", "dependence")
+_MOMENTS: Final = ("spread", "shape", "skewness", "tails", "circularity", "dependence", "repeats")
 """First words of kinds that are no change of values."""
 
 

@@ -206,6 +206,22 @@ def test_the_place_that_stands_out_is_told_in_words() -> None:
     assert names.place_words({**site, "place": "access_point 11"}) == " (most of it at access point 11)"
 
 
+def test_values_that_are_read_too_often_call_for_what_makes_them() -> None:
+    site = {
+        "site": "y",
+        "p_value": 1e-9,
+        "share": None,
+        "family": "repeats, each",
+        "place": "the value -92, read 18 times",
+    }
+    report = {**_unlisted(), "unlisted": {"p_value": 1e-9, "sites": ["y"], "located": [site]}}
+    story = tell(report)
+    assert "lies in the repeats of the readings (most of it at the value -92, read 18 times)" in story.meaning
+    assert (
+        "cause the repeats of the readings (a receiver at its limit, a sensor that is stuck" in story.action
+    )
+
+
 def _report(**terms: list[float]) -> names.Any:
     row = {"sites": ["y"], "z": 1.0, "p_value": 0.5, "adjusted_p_value": 1.0}
     absorbed = {"effect": "c", "absorbed_by": "gain", **row}
