@@ -26,6 +26,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
+from dtprob.gap.where.read_twice import read_twice
 from dtprob.gap.where.site_finding import likely_left, most_left
 from dtprob.gap.which.classes import credible
 from dtprob.gap.which.confirm import confirm
@@ -112,7 +113,7 @@ def diagnose(
 
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
     keys = jax.random.split(key, 3)
-    noted = lopsided(problem)
+    noted = [*lopsided(problem), *read_twice(problem)]
     for note in noted:
         say(f"note: {note}")
     say(f"fitting the base model to {problem.n_cluster} clusters ({problem.cluster_name})")

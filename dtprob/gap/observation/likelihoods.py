@@ -270,3 +270,8 @@ def is_discrete(family: str) -> bool:
     own = numeric.met(family)
     known: Any = getattr(dist, family.rsplit(" ", maxsplit=1)[-1], None) if own is None else own[0]
     return known is not None and bool(known.support.is_discrete)
+
+
+def is_continuous(family: str) -> bool:
+    """Whether single numbers are observed that are hardly ever alike; not where they are cut off at a limit."""
+    return not (is_discrete(family) or likelihood(family).is_complex or "Censored" in family)

@@ -20,7 +20,7 @@ from scipy import stats
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.observation import whiten
-from dtprob.gap.observation.likelihoods import is_discrete, likelihood
+from dtprob.gap.observation.likelihoods import is_continuous
 from dtprob.gap.where.site_finding import SURE, SiteFinding
 
 _FEWEST: Final = 5
@@ -39,11 +39,10 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
         x: the fit.
     """
     for name, observed in problem.compiled.observations(x).items():
-        if not _is_continuous(observed.family):
+        if not is_continuous(observed.family):
             continue
-        values, mask = jnp.asarray(problem.observed.values[name]), observed.parameters.get("mask")
-        counted = np.ones(values.shape, bool) if mask is None else np.asarray(mask) > 0
-        distinct, count = np.unique(np.asarray(values)[counted], return_counts=True)
+        values = np.asarray(problem.observed.values[name])
+        distinct, count = np.unique(values[problem.observed.counted[name]], return_counts=True)
         often = np.argsort(-count)[:_MOST]
         often = often[count[often] >= _FEWEST]
         if len(distinct) < 2 or not len(often):
@@ -56,11 +55,6 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
         if p_value <= SURE:
             place = f"the value {distinct[often][worst]:.6g}, read {count[often][worst]} times"
             yield SiteFinding(name, "repeats, each", p_value, None, place=place)
-
-
-def _is_continuous(family: str) -> bool:
-    """Whether two readings are never alike under the distribution; not where it is cut off at a limit."""
-    return not (is_discrete(family) or likelihood(family).is_complex or "Censored" in family)
 
 
 def _expected(

@@ -19,12 +19,13 @@ from dtprob.gap.where.site_finding import SURE
 N = 400
 
 
-def found(law, values):
+def found(law, values, counted=True):
     """What is said of one observation."""
     values = jnp.asarray(values)
+    counted = np.broadcast_to(counted, values.shape)
     seen = {"level": observation(law, values, "level")}
     problem = SimpleNamespace(
-        observed=SimpleNamespace(values={"level": values}),
+        observed=SimpleNamespace(values={"level": values}, counted={"level": counted}),
         compiled=SimpleNamespace(observations=lambda _x: seen),
     )
     return list(repeats(cast("Any", problem), np.zeros(0)))
@@ -109,7 +110,7 @@ def test_what_does_not_count_is_not_counted():
     mean, level = levels(3)
     seen = np.arange(N) > 30
     level[~seen] = 0.0
-    assert not found(dist.Normal(mean, 4.0).mask(seen), level)
+    assert not found(dist.Normal(mean, 4.0).mask(seen), level, seen)
     assert found(dist.Normal(mean, 4.0), level)
 
 
