@@ -91,11 +91,11 @@ def site_shares(found: Sequence[SiteFinding], gap: float, closed: Mapping[str, f
     ]
 
 
-def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, float, float]:
+def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, bool, float, float]:
     """Values by their shares, moments by their p-values; those that rounding alone parts stay in their order."""
     found, share = one
     closed = round(share or 0.0, 6) if found.moment is None else 0.0
-    return found.last, found.p_value > _TOLD, -closed, told_apart(found.p_value)
+    return not found.repeats, found.last, found.p_value > _TOLD, -closed, told_apart(found.p_value)
 
 
 def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:

@@ -2,14 +2,15 @@
 
 So are those of a receiver at its ceiling or floor, of a sensor that is stuck, and a default where nothing was measured.
 Data are rounded, so that some readings are alike under a right twin too: a value is expected as often as the values next
-to it are there, and as often as the fitted twin's density there gives within the gaps to these.
+to it are there, and as often as the fitted twin's density there gives within the gaps to these. As coarse a value may be
+read again and again in a row: no longer than neighbours are alike elsewhere, or than the density gives.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from functools import partial
-from typing import Final
+from typing import Final, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,8 +28,20 @@ _FEWEST: Final = 5
 """Readings that are alike from which on they are looked at."""
 _BESIDE: Final = 4
 """Distinct values on each side of which the one that is read most often tells how often one is."""
+_OFTEN: Final = 0.25
+"""Share of neighbours that are alike up to which a run of one value tells something: slow errors, rounded, stay long."""
+_TIMES: Final = 1.5
+"""Times what is expected that a value is read at least."""
 _MOST: Final = 64
 """Values of one observation that are looked at, those that are read most often."""
+
+
+class _Repeated(NamedTuple):
+    """A value, how often it is read, in words, and the chance that any value is read so."""
+
+    value: float
+    often: str
+    p_value: float
 
 
 def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
@@ -41,54 +54,105 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
     for name, observed in problem.compiled.observations(x).items():
         if not is_continuous(observed.family):
             continue
-        values = np.asarray(problem.observed.values[name])
-        distinct, count = np.unique(values[problem.observed.counted[name]], return_counts=True)
-        often = np.argsort(-count)[:_MOST]
-        often = often[count[often] >= _FEWEST]
-        if len(distinct) < 2 or not len(often):
+        values, counted = np.asarray(problem.observed.values[name]), problem.observed.counted[name]
+        distinct, count = np.unique(values[counted], return_counts=True)
+        if len(distinct) < 2 or count.max() < _FEWEST:
             continue
-        by_twin = _expected(observed, values.shape, distinct[often], _room(distinct)[often])
-        expected = np.maximum(np.maximum(_beside(count)[often], by_twin), 1.0)
-        tail = stats.poisson.sf(count[often] - 1, expected)
-        worst = int(np.argmin(tail))
-        p_value = float(len(distinct) * tail[worst])
-        if p_value <= SURE:
-            place = f"the value {distinct[often][worst]:.6g}, read {count[often][worst]} times"
-            yield SiteFinding(name, "repeats, each", p_value, None, place=place)
+        apart, share = _entries_apart(observed), _share_alike(values, counted)
+        pile = _pile(apart, values.shape, distinct, count, together=(1 - share) ** -2)
+        found = [pile, *_runs(apart, values, counted, distinct)]
+        worst = min(found, key=lambda one: one.p_value)
+        if worst.p_value <= SURE:
+            place = f"the value {worst.value:.6g}, read {worst.often}"
+            yield SiteFinding(name, "repeats, each", worst.p_value, None, place=place)
 
 
-def _expected(
+def _pile(
     observed: whiten.Observation,
     shape: tuple[int, ...],
-    at: Float[np.ndarray, " n"],
-    room: Float[np.ndarray, " n"],
-) -> Float[np.ndarray, " n"]:
-    """How many readings the fitted twin expects to be rounded to some values, each of such a width."""
-    if whiten.is_joint(observed.family):  # each entry of a vector by itself
-        factor = observed.parameters["scale_tril"]
-        own = {"loc": observed.parameters["loc"], "scale": jnp.sqrt(jnp.sum(factor**2, axis=-1))}
-        kept = {n: v for n, v in observed.parameters.items() if n == "mask"}
-        observed = whiten.Observation("Normal", own | kept)
-    return np.asarray(_summed(observed.parameters, at, room, family=observed.family, shape=shape))
+    distinct: np.ndarray,
+    count: np.ndarray,
+    *,
+    together: float,
+) -> _Repeated:
+    """The value that is read most surely too often, of ascending ones and how often each is read.
+
+    So many readings count as one: where errors go together, so do those that are alike, and they come back together.
+    """
+    often = np.argsort(-count)[:_MOST]
+    often = often[count[often] >= _FEWEST]
+    at, room = distinct[often], _room(distinct)[often]
+    by_twin = _expected(observed.parameters, at, room, family=observed.family, shape=shape)
+    expected = np.maximum(np.maximum(_beside(count)[often], by_twin), 1.0)
+    tail = stats.poisson.sf(np.floor(count[often] / together) - 1, expected / together)
+    tail[count[often] < _TIMES * expected] = 1.0
+    worst = int(np.argmin(tail))
+    return _Repeated(at[worst], f"{count[often][worst]} times", float(len(distinct) * tail[worst]))
+
+
+def _runs(
+    observed: whiten.Observation, values: np.ndarray, counted: np.ndarray, distinct: np.ndarray
+) -> Iterator[_Repeated]:
+    """Along each axis the longest run of one value."""
+    for axis in range(values.ndim):
+        own, counts = np.moveaxis(values, axis, 0), np.moveaxis(counted, axis, 0)
+        alike = _alike(own, counts)
+        length = np.zeros(own.shape, int)
+        for i, same in enumerate(alike):
+            length[i + 1] = np.where(same, length[i] + 1, 0)
+        steps = int(length.max(initial=0))
+        elsewhere = (alike.sum() - steps + 1) / (alike.size - steps + 1)
+        if steps + 1 < _FEWEST or elsewhere > _OFTEN:
+            continue
+        end, *beside = np.unravel_index(int(length.argmax()), length.shape)
+        run = (slice(end - steps + 1, end + 1), *beside)
+        value = own[run][0]
+        room = _room(distinct)[np.searchsorted(distinct, value)]
+        chance = _chances(observed.parameters, value, room, family=observed.family, shape=values.shape)
+        each = np.maximum(np.moveaxis(np.asarray(chance), axis, 0)[run], elsewhere)
+        yield _Repeated(float(value), f"{steps + 1} times in a row", float(alike.size * np.prod(each)))
+
+
+def _alike(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
+    """Which entries, but the first, are like the one before along the first axis."""
+    return (values[1:] == values[:-1]) & counted[1:] & counted[:-1]
+
+
+def _share_alike(values: np.ndarray, counted: np.ndarray) -> float:
+    """The share of neighbours that are alike, along the axis where most are."""
+    axes = [i for i in range(values.ndim) if values.shape[i] > 1]
+    both = [(np.moveaxis(values, i, 0), np.moveaxis(counted, i, 0)) for i in axes]
+    return max((float(_alike(*one).mean()) for one in both), default=0.0)
+
+
+def _entries_apart(observed: whiten.Observation) -> whiten.Observation:
+    """The observation, each entry of a vector by itself."""
+    if not whiten.is_joint(observed.family):
+        return observed
+    factor = observed.parameters["scale_tril"]
+    own = {"loc": observed.parameters["loc"], "scale": jnp.sqrt(jnp.sum(factor**2, axis=-1))}
+    kept = {n: v for n, v in observed.parameters.items() if n == "mask"}
+    return whiten.Observation("Normal", own | kept)
+
+
+def _chance(
+    parameters: whiten.Parameters, value: jax.Array, room: jax.Array, *, family: str, shape: tuple[int, ...]
+) -> jax.Array:
+    """The chance of each reading, in the shape of all, to be rounded to a value of such a width; 0 where none counts."""
+    observed = whiten.Observation(family, parameters)
+    density = jnp.exp(whiten.log_prob(observed, jnp.full(shape, value)))
+    return observed.masked(jnp.minimum(jnp.nan_to_num(density) * room, 1.0))
+
+
+_chances: Final = quick_jit(_chance, static_argnames=("family", "shape"))
 
 
 @partial(quick_jit, static_argnames=("family", "shape"))
-def _summed(
-    parameters: whiten.Parameters,
-    at: jax.Array,
-    room: jax.Array,
-    *,
-    family: str,
-    shape: tuple[int, ...],
+def _expected(
+    parameters: whiten.Parameters, at: jax.Array, room: jax.Array, *, family: str, shape: tuple[int, ...]
 ) -> jax.Array:
-    observed = whiten.Observation(family, parameters)
-
-    def one(place: tuple[jax.Array, jax.Array]) -> jax.Array:
-        density = jnp.exp(whiten.log_prob(observed, jnp.full(shape, place[0])))
-        chance = jnp.minimum(jnp.nan_to_num(density) * place[1], 1.0)
-        return jnp.sum(observed.masked(chance))
-
-    return jax.lax.map(one, (at, room))
+    """How many readings the fitted twin expects at each of some values."""
+    return jax.lax.map(lambda one: jnp.sum(_chance(parameters, *one, family=family, shape=shape)), (at, room))
 
 
 def _room(distinct: Float[np.ndarray, " n"]) -> Float[np.ndarray, " n"]:

@@ -48,6 +48,11 @@ class SiteFinding:
         """What of an observation is wrong: its spread, or what lies beyond; None where values are."""
         return moment(self.family)
 
+    @property
+    def repeats(self) -> bool:
+        """Whether readings are exactly alike, which no wrong value or spread makes them."""
+        return self.moment == "repeats"
+
 
 def most_gained(found: Iterable[SiteFinding]) -> float:
     """Nats that moving the best of these sites would gain; zero where there is none."""
@@ -89,11 +94,14 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
     score = max((f.score for f, one in zip(findings, values, strict=True) if one), default=0.0)
     by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
     return [
-        replace(f, last=of_values <= SURE and is_value == by_noise)
+        replace(f, last=of_values <= SURE and is_value == by_noise and not f.repeats)
         for f, is_value in zip(findings, values, strict=True)
     ]
 
 
-def rank(found: SiteFinding) -> tuple[bool, float, float]:
-    """The surest first, then the largest gain; sites that rounding alone parts, one acting through another, are equal."""
-    return found.last, told_apart(found.p_value), -told_apart(found.gain or 0.0)
+def rank(found: SiteFinding) -> tuple[bool, bool, float, float]:
+    """The surest first, then the largest gain; sites that rounding alone parts, one acting through another, are equal.
+
+    What is read again and again comes before all others: it makes values and spreads look wrong, and not they it.
+    """
+    return not found.repeats, found.last, told_apart(found.p_value), -told_apart(found.gain or 0.0)

@@ -11,7 +11,7 @@ import pytest
 
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.site_finding import SiteFinding, shadows_last
+from dtprob.gap.where.site_finding import SiteFinding, rank, shadows_last
 from dtprob.inference import Laplace
 from dtprob.models.declaration import model
 from tests.unit.gap.examples import line
@@ -74,3 +74,11 @@ def test_far_off_it_is_still_told_whether_the_mean_or_its_noise_is_wrong(what):
     assert (site["site"], site["family"].startswith("spread")) == (
         ("mean", False) if what == "mean" else ("y", True)
     )
+
+
+def test_what_is_read_again_and_again_comes_first() -> None:
+    """A default of 3% spreads the readings far more surely than it is counted."""
+    alike = SiteFinding("y", "repeats, each", 1e-6, None, place="the value 0, read 17 times")
+    spread, mean = SiteFinding("y", "spread, y", 1e-200, None), SiteFinding("mean", "additive, y", 1e-90, 5.0)
+    assert min(shadows_last([mean, spread, alike], 4.0), key=rank) == alike
+    assert not any(found.repeats for found in (spread, mean))
