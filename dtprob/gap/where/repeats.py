@@ -60,11 +60,10 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
             continue
         apart, share = _entries_apart(observed), _share_alike(values, counted)
         pile = _pile(apart, values.shape, distinct, count, together=(1 - share) ** -2)
-        found = [pile, *_runs(apart, values, counted, distinct)]
-        worst = min(found, key=lambda one: one.p_value)
-        if worst.p_value <= SURE:
-            place = f"the value {worst.value:.6g}, read {worst.often}"
-            yield SiteFinding(name, "repeats, each", worst.p_value, None, place=place)
+        runs = sorted(_runs(apart, values, counted, distinct), key=lambda one: one.p_value)
+        for sure in [one for one in (pile, *runs) if one.p_value <= SURE][:1]:
+            place = f"the value {sure.value:.6g}, read {sure.often}"
+            yield SiteFinding(name, "repeats, each", sure.p_value, None, place=place)
 
 
 def _pile(

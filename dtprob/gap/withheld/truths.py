@@ -88,9 +88,10 @@ SITES: Final[Mapping[str, Mapping[str, tuple[str, ...]]]] = {
     },
     "labels": {
         **dict.fromkeys(
-            ("regional_bias", "scale_bias", "stale_map", "saturation", "swapped_segments", "periodic_bias"),
+            ("regional_bias", "scale_bias", "stale_map", "swapped_segments", "periodic_bias"),
             ("predicted_label",),
         ),
+        "saturation": ("predicted_label", "y"),
         "label_noise": ("label_deviation", "spread of y"),
         "autocorrelated_errors": ("predicted_label", "y"),
     },
