@@ -59,9 +59,11 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
         if len(distinct) < 2 or count.max() < _FEWEST:
             continue
         apart, share = _entries_apart(observed), _share_alike(values, counted)
-        pile = _pile(apart, values.shape, distinct, count, together=(1 - share) ** -2)
+        together = 1 / max(1 - share, 1 / values.size) ** 2
+        pile = _pile(apart, values.shape, distinct, count, together=together)
         runs = sorted(_runs(apart, values, counted, distinct), key=lambda one: one.p_value)
-        for sure in [one for one in (pile, *runs) if one.p_value <= SURE][:1]:
+        sure = next((one for one in (pile, *runs) if one.p_value <= SURE), None)
+        if sure is not None:
             place = f"the value {sure.value:.6g}, read {sure.often}"
             yield SiteFinding(name, "repeats, each", sure.p_value, None, place=place)
 

@@ -132,6 +132,12 @@ def test_vectors_are_looked_at_entry_by_entry():
     assert found(law, np.minimum(level, np.sort(level)[-15]).reshape(50, 8))
 
 
+def test_one_reading_that_is_filed_for_every_antenna_is_no_sensor_that_is_stuck():
+    mean, level = levels(7)
+    law = dist.Normal(jnp.asarray(mean)[:, None], 4.0).expand([N, 6])
+    assert not found(law, np.repeat(level[:, None], 6, axis=1))
+
+
 def test_what_does_not_count_is_not_counted():
     mean, level = levels(3)
     seen = np.arange(N) > 30
