@@ -30,8 +30,9 @@ def read_twice(problem: Problem) -> list[str]:
     found = []
     for name, site in problem.declaration.observed.items():
         count = int(problem.observed.counted[name].sum())
-        again = _copies(problem, name, site) if count <= _MOST else 0
-        if again:
+        if count > _MOST or not is_continuous(problem.families[name]):
+            continue
+        if again := _copies(problem, name, site):
             what = f"{again} of {count} values of {site.argument or name} are others again, the same in every column"
             found.append(f"{what}: was a log read twice? They count as independent; leave copies out")
     return found
@@ -42,7 +43,7 @@ def _copies(problem: Problem, name: str, site: Site) -> int:
     counted = problem.observed.counted[name]
     values = np.asarray(problem.observed.values[name])[counted]
     given = [np.broadcast_to(column, site.shape)[counted] for column in all_columns(problem, site).values()]
-    if not given or not is_continuous(problem.families[name]):
+    if not given:
         return 0
     _, circumstances = np.unique(np.stack(given, axis=1), axis=0, return_inverse=True)
     _, first, count = np.unique(

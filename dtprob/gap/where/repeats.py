@@ -8,7 +8,7 @@ read again and again in a row: no longer than neighbours are alike elsewhere, or
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from functools import partial
 from typing import Final, NamedTuple
 
@@ -58,10 +58,12 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
         distinct, count = np.unique(values[counted], return_counts=True)
         if len(distinct) < 2 or count.max() < _FEWEST:
             continue
-        apart, share = _entries_apart(observed), _share_alike(values, counted)
+        apart = _entries_apart(observed)
+        alike = {i: _alike(values, counted, i) for i in range(values.ndim) if values.shape[i] > 1}
+        share = max(float(along.mean()) for along in alike.values())
         together = 1 / max(1 - share, 1 / values.size) ** 2
         pile = _pile(apart, values.shape, distinct, count, together=together)
-        runs = sorted(_runs(apart, values, counted, distinct), key=lambda one: one.p_value)
+        runs = sorted(_runs(apart, values, alike, distinct), key=lambda one: one.p_value)
         sure = next((one for one in (pile, *runs) if one.p_value <= SURE), None)
         if sure is not None:
             place = f"the value {sure.value:.6g}, read {sure.often}"
@@ -92,38 +94,30 @@ def _pile(
 
 
 def _runs(
-    observed: whiten.Observation, values: np.ndarray, counted: np.ndarray, distinct: np.ndarray
+    observed: whiten.Observation, values: np.ndarray, alike: Mapping[int, np.ndarray], distinct: np.ndarray
 ) -> Iterator[_Repeated]:
     """Along each axis the longest run of one value."""
-    for axis in range(values.ndim):
-        own, counts = np.moveaxis(values, axis, 0), np.moveaxis(counted, axis, 0)
-        alike = _alike(own, counts)
-        length = np.zeros(own.shape, int)
-        for i, same in enumerate(alike):
-            length[i + 1] = np.where(same, length[i] + 1, 0)
-        steps = int(length.max(initial=0))
-        elsewhere = (alike.sum() - steps + 1) / (alike.size - steps + 1)
+    for axis, same in alike.items():
+        length = np.zeros((len(same) + 1, *same.shape[1:]), int)
+        for i, again in enumerate(same):
+            length[i + 1] = np.where(again, length[i] + 1, 0)
+        steps = int(length.max())
+        elsewhere = (same.sum() - steps + 1) / (same.size - steps + 1)
         if steps + 1 < _FEWEST or elsewhere > _OFTEN:
             continue
         end, *beside = np.unravel_index(int(length.argmax()), length.shape)
         run = (slice(end - steps + 1, end + 1), *beside)
-        value = own[run][0]
+        value = np.moveaxis(values, axis, 0)[run][0]
         room = _room(distinct)[np.searchsorted(distinct, value)]
         chance = _chances(observed.parameters, value, room, family=observed.family, shape=values.shape)
         each = np.maximum(np.moveaxis(np.asarray(chance), axis, 0)[run], elsewhere)
-        yield _Repeated(float(value), f"{steps + 1} times in a row", float(alike.size * np.prod(each)))
+        yield _Repeated(float(value), f"{steps + 1} times in a row", float(same.size * np.prod(each)))
 
 
-def _alike(values: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """Which entries, but the first, are like the one before along the first axis."""
-    return (values[1:] == values[:-1]) & counted[1:] & counted[:-1]
-
-
-def _share_alike(values: np.ndarray, counted: np.ndarray) -> float:
-    """The share of neighbours that are alike, along the axis where most are."""
-    axes = [i for i in range(values.ndim) if values.shape[i] > 1]
-    both = [(np.moveaxis(values, i, 0), np.moveaxis(counted, i, 0)) for i in axes]
-    return max((float(_alike(*one).mean()) for one in both), default=0.0)
+def _alike(values: np.ndarray, counted: np.ndarray, axis: int) -> np.ndarray:
+    """Which entries, but the first, are like the one before along an axis, which comes first."""
+    own, counts = np.moveaxis(values, axis, 0), np.moveaxis(counted, axis, 0)
+    return (own[1:] == own[:-1]) & counts[1:] & counts[:-1]
 
 
 def _entries_apart(observed: whiten.Observation) -> whiten.Observation:
