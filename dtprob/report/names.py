@@ -5,6 +5,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
+from dtprob.gap.where import kinds
 from dtprob.report.json_schema import Cause, Coordinates, Interval, Remainder, Site, Size
 from dtprob.report.units import (
     Reading,
@@ -18,8 +19,6 @@ from dtprob.report.units import (
     with_unit,
 )
 
-_MOMENTS: Final = ("spread", "shape", "skewness", "tails", "circularity", "dependence", "repeats")
-"""What of observations may be wrong where their values are right."""
 _CAPITALS = {
     "iq": "I/Q",
     "ack": "ACK",
@@ -101,8 +100,7 @@ def place_words(site: Site) -> str:
 
 def moment(site: Site) -> str | None:
     """What of an observation is wrong where its values are right, as its family tells it."""
-    kind = site.get("family", "").partition(",")[0]
-    return kind if kind.split(" ")[0] in _MOMENTS else None
+    return kinds.moment(site.get("family", ""))
 
 
 def spoken(text: str, codes: Iterable[str]) -> str:

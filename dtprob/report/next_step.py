@@ -6,6 +6,13 @@ from typing import Any
 from dtprob.report.json_schema import Report, Site
 from dtprob.report.names import block, detail, listing, located_words, moment, significant, words
 
+_SUCH = {
+    "repeats": "a receiver at its limit, a sensor that is stuck, a default where nothing was measured",
+    "skewness": "some readings err to one side: a path without line of sight, interference, losses",
+    "tails": "a few readings are farther off than others, or none is",
+    "dispersion": "a schedule or an average makes it more even than chance",
+}
+"""What makes such a moment wrong, mostly."""
 _MUCH = 1.5
 """Times as much that everything again costs from which that is told."""
 
@@ -81,8 +88,8 @@ def changed(sites: Sequence[Site]) -> str:
 def _changed(site: Site) -> str:
     what = (moment(site) or "values").partition(" ")[0]
     verb = "cause" if what in ("dependence", "repeats") else "change"
-    such = " (a receiver at its limit, a sensor that is stuck, a default where nothing was measured)"
-    return f"{verb} the {located_words(site)}{such * (what == 'repeats')}"
+    such = f" ({_SUCH[what]})" if what in _SUCH else ""
+    return f"{verb} the {located_words(site)}{such}"
 
 
 def _saved(plan: Mapping[str, Any]) -> str:

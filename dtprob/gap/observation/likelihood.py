@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
 import jax
+from jax.typing import ArrayLike
 
 from dtprob.gap.observation.residuals import Parameters
 
@@ -41,8 +42,8 @@ class Likelihood:
         respread: the same for the first row that is no location.
         respread_about: the same by about the step, where the exact unit is slow to tell.
         log_scale: of families whose first rows are normal, the logarithm of the scale for a unit step of that row.
-        probability: (parameters, first row) -> probability of a smaller value, of families that are neither normal nor
-            discrete and whose first row grows with the value.
+        probability: (parameters, rows) -> probability of a smaller value than theirs, of families of numbers that are not
+            normal; see `dtprob.gap.observation.probabilities`.
         is_outcome: whether one of a few outcomes is seen.
         is_complex: whether the first two rows are the real and the imaginary part of one.
         trailing: axes that a parameter has beyond those of the value.
@@ -61,7 +62,7 @@ class Likelihood:
     respread: Move | None = None
     respread_about: Move | None = None
     log_scale: float | None = None
-    probability: Rows | None = None
+    probability: Callable[[Parameters, jax.Array], ArrayLike] | None = None
     is_outcome: bool = False
     is_complex: bool = False
     trailing: Mapping[str, int] = field(default_factory=dict)

@@ -11,7 +11,16 @@ import jax.numpy as jnp
 import numpyro.distributions as dist
 
 from dtprob.effects.distributions import ComplexStudentT
-from dtprob.gap.observation import compound, discrete, limited, location_scale, moves, numeric, residuals
+from dtprob.gap.observation import (
+    compound,
+    discrete,
+    limited,
+    location_scale,
+    moves,
+    numeric,
+    probabilities,
+    residuals,
+)
 from dtprob.gap.observation.beta_binomial import BETA_BINOMIAL
 from dtprob.gap.observation.likelihood import Likelihood
 from dtprob.models.complex_normal import ComplexNormal
@@ -73,6 +82,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         located=1,
         relocate=moves.to_loc(lambda p: p["scale"] * jnp.sqrt((p["df"] + 3) / (p["df"] + 1))),
         respread=moves.grown("scale", lambda p: jnp.sqrt((p["df"] + 3) / (2 * p["df"]))),
+        probability=probabilities.student,
     ),
     "Laplace": Likelihood(
         dist.Laplace,
@@ -82,6 +92,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         located=1,
         relocate=moves.to_loc(lambda p: p["scale"]),
         respread=moves.grown("scale"),
+        probability=probabilities.laplace,
     ),
     "MultivariateNormal": Likelihood(
         lambda loc, scale_tril: dist.MultivariateNormal(loc, scale_tril=scale_tril),
@@ -104,7 +115,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.exponential_residual,
         residuals.exponential_shift,
         relocate=moves.grown("rate", lambda _: -1.0),
-        probability=lambda _, row: -jnp.expm1(-jnp.maximum(1.0 + row, 0.0)),
+        probability=probabilities.exponential,
     ),
     "Gamma": Likelihood(
         dist.Gamma,
@@ -114,7 +125,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         located=1,
         relocate=moves.grown("rate", lambda p: -(p["concentration"] ** -0.5)),
         respread=moves.at_same_mean(residuals.gamma_spread),
-        probability=residuals.gamma_probability,
+        probability=probabilities.gamma,
     ),
     "Weibull": Likelihood(
         dist.Weibull,
@@ -124,6 +135,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         located=1,
         relocate=moves.grown("scale", lambda p: 1 / p["concentration"]),
         respread=moves.weibull_respread,
+        probability=probabilities.exponential,
     ),
     "Beta": Likelihood(
         dist.Beta,
@@ -133,6 +145,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         located=1,
         relocate=moves.to_odds,
         respread=moves.beta_respread,
+        probability=probabilities.beta,
     ),
     "Logistic": location_scale.LOGISTIC,
     "Gumbel": location_scale.GUMBEL,
@@ -143,6 +156,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         residuals.half_normal_residual,
         residuals.half_normal_shift,
         relocate=moves.grown("scale", lambda _: 0.5**0.5),
+        probability=probabilities.half_normal,
     ),
     "InverseGamma": Likelihood(
         dist.InverseGamma,
@@ -152,6 +166,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         located=1,
         relocate=moves.grown("rate", lambda p: -(p["concentration"] ** -0.5)),
         respread=moves.at_same_mean(residuals.gamma_spread),
+        probability=probabilities.inverse_gamma,
     ),
     "VonMises": Likelihood(
         dist.VonMises,
@@ -163,6 +178,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         respread=moves.grown(
             "concentration", lambda p: moves.held(p["concentration"] * residuals.von_mises_spread(p)[2])
         ),
+        probability=probabilities.von_mises,
     ),
     "GammaPoisson": Likelihood(
         dist.GammaPoisson,
@@ -175,6 +191,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         ),
         respread=moves.at_same_mean(discrete.counts_spread),
         respread_about=moves.at_same_mean(discrete.counts_spread_about),
+        probability=probabilities.gamma_poisson,
     ),
     "Poisson": Likelihood(
         dist.Poisson,
@@ -183,6 +200,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.poisson_shift,
         relocate=moves.grown("rate", lambda p: jnp.where(p["rate"] > 0, p["rate"], 1.0) ** -0.5),
         density=discrete.poisson_density,
+        probability=probabilities.poisson,
     ),
     "GeometricProbs": Likelihood(
         dist.Geometric,
@@ -191,6 +209,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.geometric_shift,
         relocate=discrete.geometric_relocate,
         density=discrete.geometric_density,
+        probability=probabilities.geometric,
     ),
     "BetaBinomial": BETA_BINOMIAL,
     "BernoulliLogits": Likelihood(
@@ -216,6 +235,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.bernoulli_residual,
         discrete.bernoulli_shift,
         relocate=moves.to_logits,
+        probability=probabilities.binomial,
     ),
     "BinomialProbs": Likelihood(
         _binomial,
@@ -224,6 +244,7 @@ LIKELIHOODS: Final[Mapping[str, Likelihood]] = {
         discrete.probs_shift,
         density=discrete.probs_density,
         impossible=discrete.probs_impossible,
+        probability=probabilities.binomial,
     ),
     "CategoricalLogits": Likelihood(
         lambda logits: dist.Categorical(logits=logits), ("logits",), **_CLASSES, trailing={"logits": 1}

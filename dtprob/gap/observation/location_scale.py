@@ -17,15 +17,27 @@ import numpyro.distributions as dist
 from dtprob.gap.observation.likelihood import Likelihood
 from dtprob.gap.observation.residuals import EULER, Parameters
 
+_NEAR: Final = 0.9
+"""Psi up to which it tells the value; it ends at 1."""
+_FARTHEST: Final = 2.0 - 1e-12
+"""Largest psi times value of a Cauchy distribution that tells a size; it ends at 2."""
+
 
 def _location_scale(
     make: Callable[..., Any],
     slope: Callable[[jax.Array], jax.Array],
-    location: float,
-    scale: float,
-    common: float = 0.0,
+    information: tuple[float, float, float],
+    probability: Callable[[jax.Array, jax.Array], jax.Array],
 ) -> Likelihood:
-    """The likelihood of a family with these entries of its information at unit scale."""
+    """The likelihood of a family.
+
+    Args:
+        make: the distribution from its location and scale.
+        slope: psi of r.
+        information: on the location, on the scale and on both, at unit scale.
+        probability: of smaller values, from psi and r psi; a fit may have taken from each what it likes.
+    """
+    location, scale, common = information
     root, left = math.sqrt(location), math.sqrt(scale - common**2 / location)
 
     def residual(p: Parameters, value: jax.Array) -> jax.Array:
@@ -45,13 +57,46 @@ def _location_scale(
         loc = p["loc"] - common / location * p["scale"] * (factor - 1.0)
         return {**p, "loc": loc, "scale": p["scale"] * factor}
 
+    def smaller(_: Parameters, rows: jax.Array) -> jax.Array:
+        psi = rows[0] * root
+        return probability(psi, rows[1] * left + 1.0 + common / location * psi)
+
     return Likelihood(
-        make, ("loc", "scale"), residual, shift, located=1, relocate=relocate, respread=respread
+        make,
+        ("loc", "scale"),
+        residual,
+        shift,
+        located=1,
+        relocate=relocate,
+        respread=respread,
+        probability=smaller,
     )
 
 
-LOGISTIC: Final = _location_scale(dist.Logistic, lambda r: jnp.tanh(r / 2), 1 / 3, (3 + math.pi**2) / 9)
-CAUCHY: Final = _location_scale(dist.Cauchy, lambda r: 2 * r / (1 + r**2), 0.5, 0.5)
+def _logistic(psi: jax.Array, size: jax.Array) -> jax.Array:
+    """Near the location psi tells the value, far from it, where psi is 1 or -1, its product with the value."""
+    near = 2 * jnp.arctanh(jnp.clip(psi, -_NEAR, _NEAR))
+    far = jnp.sign(psi) * jnp.maximum(size, 0.0) / jnp.clip(jnp.abs(psi), _NEAR, 1.0)
+    return jax.nn.sigmoid(jnp.where(jnp.abs(psi) < _NEAR, near, far))
+
+
+def _cauchy(psi: jax.Array, size: jax.Array) -> jax.Array:
+    """Far values turn back in psi, which tells their sign, and have their size from its product with the value."""
+    left = 2.0 - jnp.clip(size, 0.0, _FARTHEST)
+    far = jnp.sign(psi) * jnp.sqrt(jnp.maximum(size, 0.0) / left)
+    return 0.5 + jnp.arctan(jnp.where(size < 1.0, psi / left, far)) / math.pi
+
+
+def _gumbel(psi: jax.Array, size: jax.Array) -> jax.Array:
+    """Psi tells all values but the largest, of which it is 1."""
+    near, far = -jnp.log1p(-jnp.minimum(psi, _NEAR)), size / jnp.clip(psi, _NEAR, 1.0)
+    return jnp.exp(-jnp.exp(-jnp.where(psi < _NEAR, near, far)))
+
+
+LOGISTIC: Final = _location_scale(
+    dist.Logistic, lambda r: jnp.tanh(r / 2), (1 / 3, (3 + math.pi**2) / 9, 0.0), _logistic
+)
+CAUCHY: Final = _location_scale(dist.Cauchy, lambda r: 2 * r / (1 + r**2), (0.5, 0.5, 0.0), _cauchy)
 GUMBEL: Final = _location_scale(
-    dist.Gumbel, lambda r: -jnp.expm1(-r), 1.0, (1 - EULER) ** 2 + math.pi**2 / 6, EULER - 1
+    dist.Gumbel, lambda r: -jnp.expm1(-r), (1.0, (1 - EULER) ** 2 + math.pi**2 / 6, EULER - 1), _gumbel
 )

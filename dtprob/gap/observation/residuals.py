@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 from jax.scipy.linalg import solve_triangular
-from jax.scipy.special import digamma, gammainc, i0e, i1e, polygamma
+from jax.scipy.special import digamma, i0e, i1e, polygamma
 
 from dtprob.effects.distributions import ComplexStudentT
 
@@ -89,7 +89,7 @@ def student_residual(p: Parameters, value: jax.Array) -> jax.Array:
     weight = (v + 1) / (v + r**2)
     location = weight * r / jnp.sqrt((v + 1) / (v + 3))
     scale = weight * r**2 - 1.0
-    root, common, spread = _student_information(v)
+    root, common, spread = student_information(v)
     w = jnp.minimum(v, _NORMAL_FROM)
     heavier = (w + 1) / (w + r**2) * r**2
     df = (digamma((w + 1) / 2) - digamma(w / 2) - 1 / w - jnp.log1p(r**2 / w) + heavier / w) / 2
@@ -99,12 +99,12 @@ def student_residual(p: Parameters, value: jax.Array) -> jax.Array:
 def student_shift(p: Parameters, t: Parameters) -> jax.Array:
     """Shift of the rows of a Student t distribution."""
     v = p["df"]
-    root, common, spread = _student_information(v)
+    root, common, spread = student_information(v)
     location, scale = t["loc"] * jnp.sqrt((v + 1) / (v + 3)) / p["scale"], t["scale"] * root / p["scale"]
     return jnp.stack([location, scale + t["df"] * common / root, t["df"] * spread])
 
 
-def _student_information(v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
+def student_information(v: jax.Array) -> tuple[jax.Array, jax.Array, jax.Array]:
     """Root of a Student t's information on the log scale, that on it and v, and the root of v's where the scale is free.
 
     Source: Lange, Little and Taylor, Robust Statistical Modeling Using the t Distribution, JASA 84 (1989), appendix B.
@@ -163,12 +163,6 @@ def gamma_shift(p: Parameters, t: Parameters) -> jax.Array:
     a = p["concentration"]
     mean = t["concentration"] / a - t["rate"] / p["rate"]
     return jnp.stack([jnp.sqrt(a) * mean, t["concentration"] * gamma_spread(p)])
-
-
-def gamma_probability(p: Parameters, row: jax.Array) -> jax.Array:
-    """Probability of a smaller value than that of a first row."""
-    a = p["concentration"]
-    return gammainc(a, jnp.maximum(a + jnp.sqrt(a) * row, 0.0))
 
 
 def weibull_residual(p: Parameters, value: jax.Array) -> jax.Array:

@@ -1,26 +1,28 @@
-"""What neither mean nor spread tells of observations: their skewness and tails, and what goes together.
+"""What neither mean nor spread tells of observations: their skewness, tails and evenness, and what goes together.
 
 Rows of a right twin are independent of each other, and normal where the observation is. Dependence is the product of two
-rows; skewness and tails are smooth functions of a normal row that no small change of its mean or scale moves (Neyman's
-smooth tests with fitted parameters: Thomas and Pierce, JASA 74 (1979)). Complex rows have a product with the conjugate, and
-their square where noise is not circular (Picinbono, IEEE Trans. Signal Process. 42 (1994)). All are bounded: one far row
-of a right twin must not look like more. What each is of a right twin, replicates tell.
+rows; skewness and tails are functions of a normal score that no small change of its mean or scale moves (Neyman's smooth
+tests with fitted parameters: Thomas and Pierce, JASA 74 (1979)), pooled over enough readings for far ones to be a few
+among many. What has no spread of its own, counts and waits, may be spread less than its mean says. Complex rows have a
+product with the conjugate, and their square where noise is not circular (Picinbono, IEEE Trans. Signal Process. 42 (1994)).
+All are bounded: one far row of a right twin must not look like more. What each is of a right twin, replicates tell.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Iterator
 from typing import Final
 
 import jax.numpy as jnp
 import numpy as np
-from scipy.special import ndtr
+from scipy.special import ndtri
 
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import Likelihood, likelihood
 from dtprob.gap.observation.residuals import Parameters
-from dtprob.gap.where.bounded import beside, complex_tails, scored, skewness, tails
+from dtprob.gap.where.bounded import beside, complex_tails, dispersion, scored, skewness, tails
 from dtprob.gap.where.families import Family, Pattern
 
 _MOST: Final = 1 << 16
@@ -29,6 +31,10 @@ _HEAVIEST: Final = 4.0
 """Kurtosis over replicates up to which a sum of products of outcomes is looked at; 3 of a normal one."""
 _TOLD: Final = 3.3
 """The same, told by the rows' own kurtosis and the number of products."""
+_LEAST: Final = 1e-12
+"""Probabilities are kept so far from zero and one."""
+_POOLED: Final = 24
+"""Readings that skewness and tails are pooled over, at least: so many have sums that are nearly normal."""
 _OUTPUTS: Final = 8
 """Entries of a last axis up to which each pair is looked at."""
 _LATEST: Final = 4
@@ -37,14 +43,6 @@ _LONG: Final = 8
 """Positions of an axis from which on that is looked at."""
 _MOST_PAIRS: Final = 4096
 """Pairs of components and outputs up to which each is."""
-_MOMENTS: Final = ("spread", "shape", "skewness", "tails", "circularity", "dependence", "repeats")
-"""First words of kinds that are no change of values."""
-
-
-def moment(family: str) -> str | None:
-    """What of an observation a family of this label moves, if not values: "spread", "dependence along link"."""
-    kind = family.partition(",")[0]
-    return kind if kind.split(" ")[0] in _MOMENTS else None
 
 
 def further_moments(
@@ -77,14 +75,24 @@ def further_moments(
             n: r for n, r in products.items() if n > name and problem.declaration.observed[n].axes == axes
         }
         shape = _shape(known, observations[name].parameters, row[:, 0], every[name])
-        for kind, values in (*shape, *_dependence(products[name], axes, others)):
-            for kept in ((), *((i,) for i in range(len(axes)) if values.shape[1 + i] > 1)):
+        pooled = [(kind, values, _POOLED) for kind, values in shape]
+        pooled += [(kind, values, 1) for kind, values in _dependence(products[name], axes, others)]
+        for kind, values, least in pooled:
+            for kept in _kept(values.shape[1:], least):
                 scores = _pooled(values, kept)
+                if kind == "dispersion":  # what is spread more shows where values are, entry by entry
+                    scores[0] = np.minimum(scores[0], 0.0)
                 if not known.is_outcome or _is_near_normal(scores[1:]):
                     pattern = Pattern(axes[kept[0]] if kept else "common", kept)
                     yield name, Family(kind, pattern, np.ones(())), scores
         for kind, scores in _delayed(products[name], axes, is_outcome=known.is_outcome):
             yield name, Family(kind, Pattern("each", ()), np.ones(())), scores
+
+
+def _kept(shape: tuple[int, ...], least: int) -> Iterator[tuple[int, ...]]:
+    """No axis, or one, that leaves at least so many entries to be pooled."""
+    wide = [()] + [(i,) for i, n in enumerate(shape) if n > 1]
+    return (kept for kept in wide if math.prod(shape) >= least * math.prod(shape[i] for i in kept))
 
 
 def _pooled(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
@@ -108,13 +116,16 @@ def _shape(
         yield "circularity", scored(row, is_normal=True) ** 2
         yield "tails", complex_tails(row)
     elif known.log_scale is not None:
-        yield "skewness", skewness(ndtr(row))
-        yield "tails", tails(ndtr(row))
+        yield "skewness", skewness(row)
+        yield "tails", tails(row)
     elif known.probability is not None:
-        probability = np.asarray(known.probability(parameters, jnp.asarray(row)))
+        smaller = known.probability(parameters, jnp.asarray(np.moveaxis(every, 1, 0)))
+        score = ndtri(np.clip(np.asarray(smaller, float), _LEAST, 1 - _LEAST))
         told = scored(every, is_normal=False)
-        yield "skewness", beside(skewness(probability), told)
-        yield "tails", beside(tails(probability), told)
+        yield "skewness", beside(skewness(score), told)
+        yield "tails", beside(tails(score), told)
+        if known.located is None:
+            yield "dispersion", beside(dispersion(score), told)
 
 
 def _dependence(

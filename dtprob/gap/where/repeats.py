@@ -1,4 +1,4 @@
-"""Readings that are exactly alike, more of them than a continuous distribution gives.
+"""Readings that are exactly alike, more of them than a continuous distribution gives, or than counts next to them.
 
 So are those of a receiver at its ceiling or floor, of a sensor that is stuck, and a default where nothing was measured.
 Data are rounded, so that some readings are alike under a right twin too: a value is expected as often as the values next
@@ -21,7 +21,8 @@ from scipy import stats
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.observation import whiten
-from dtprob.gap.observation.likelihoods import is_continuous
+from dtprob.gap.observation.likelihoods import is_continuous, is_discrete, likelihood
+from dtprob.gap.where.count_piles import MOST, count_piles
 from dtprob.gap.where.site_finding import SURE, SiteFinding
 
 _FEWEST: Final = 5
@@ -52,22 +53,46 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
         x: the fit.
     """
     for name, observed in problem.compiled.observations(x).items():
-        if not is_continuous(observed.family):
-            continue
         values, counted = np.asarray(problem.observed.values[name]), problem.observed.counted[name]
-        distinct, count = np.unique(values[counted], return_counts=True)
-        if len(distinct) < 2 or count.max() < _FEWEST:
+        if is_continuous(observed.family):
+            found = _readings(observed, values, counted)
+        elif is_discrete(observed.family) and not likelihood(observed.family).is_outcome:
+            found = _counts(observed, values, counted)
+        else:
             continue
-        apart = _entries_apart(observed)
-        alike = {i: _alike(values, counted, i) for i in range(values.ndim) if values.shape[i] > 1}
-        share = max(float(along.mean()) for along in alike.values())
-        together = 1 / max(1 - share, 1 / values.size) ** 2
-        pile = _pile(apart, values.shape, distinct, count, together=together)
-        runs = sorted(_runs(apart, values, alike, distinct), key=lambda one: one.p_value)
-        sure = next((one for one in (pile, *runs) if one.p_value <= SURE), None)
+        sure = next((one for one in found if one.p_value <= SURE), None)
         if sure is not None:
             place = f"the value {sure.value:.6g}, read {sure.often}"
             yield SiteFinding(name, "repeats, each", sure.p_value, None, place=place)
+
+
+def _readings(observed: whiten.Observation, values: np.ndarray, counted: np.ndarray) -> list[_Repeated]:
+    """The value that is read most surely too often, and the runs of one value, the surest first."""
+    distinct, count = np.unique(values[counted], return_counts=True)
+    if len(distinct) < 2 or count.max() < _FEWEST:
+        return []
+    apart = _entries_apart(observed)
+    alike = {i: _alike(values, counted, i) for i in range(values.ndim) if values.shape[i] > 1}
+    share = max(float(along.mean()) for along in alike.values())
+    together = 1 / max(1 - share, 1 / values.size) ** 2
+    pile = _pile(apart, values.shape, distinct, count, together=together)
+    return [pile, *sorted(_runs(apart, values, alike, distinct), key=lambda one: one.p_value)]
+
+
+def _counts(observed: whiten.Observation, values: np.ndarray, counted: np.ndarray) -> list[_Repeated]:
+    """The count that is seen most surely too often."""
+    own = values[counted]
+    if not own.size or np.ptp(own) > MOST or np.any(own != np.round(own)):
+        return []
+    at = np.arange(own.min(), own.max() + 1.0)
+    seen = np.bincount((own - own.min()).astype(int), minlength=len(at))
+    expected = _expected(
+        observed.parameters, at, np.ones(len(at)), family=observed.family, shape=values.shape
+    )
+    tail = count_piles(seen.astype(float), np.asarray(expected))
+    worst = int(np.argmin(tail))
+    p_value = float((seen > 0).sum() * tail[worst])
+    return [_Repeated(at[worst], f"{seen[worst]} times", p_value)]
 
 
 def _pile(
@@ -136,7 +161,8 @@ def _chance(
     """The chance of each reading, in the shape of all, to be rounded to a value of such a width; 0 where none counts."""
     observed = whiten.Observation(family, parameters)
     density = jnp.exp(whiten.log_prob(observed, jnp.full(shape, value)))
-    return observed.masked(jnp.minimum(jnp.nan_to_num(density) * room, 1.0))
+    density = jnp.where(value > parameters.get("total_count", jnp.inf), 0.0, jnp.nan_to_num(density))
+    return observed.masked(jnp.minimum(density * room, 1.0))
 
 
 _chances: Final = quick_jit(_chance, static_argnames=("family", "shape"))

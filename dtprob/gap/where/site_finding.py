@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from dtprob.gap.tails import LOG_SMALLEST, told_apart
-from dtprob.gap.where.moments import moment
+from dtprob.gap.where.kinds import moment
 
 SURE: Final = 0.005
 """Probability below which a site is surely wrong."""

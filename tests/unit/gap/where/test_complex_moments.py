@@ -117,7 +117,9 @@ def test_nothing_is_noticed_where_nothing_is_wrong():
 
 
 def test_a_change_of_power_does_not_move_the_tails():
-    power, weight = np.polynomial.laguerre.laggauss(60)
+    power = np.linspace(0, 60, 1_000_001)
+    weight = np.exp(-power) * power[1]
+    weight[0] /= 2
     row = np.sqrt(2 * power) + 0j
     assert abs(np.sum(weight * complex_tails(row))) < 1e-6
     assert abs(np.sum(weight * power * complex_tails(row))) < 1e-6

@@ -200,15 +200,41 @@ def test_what_is_not_surely_wrong_leaves_its_gain_as_far_as_it_is_likely_to_be_w
     assert likely_left([]) == 0.0
 
 
-def test_one_far_row_of_many_is_no_tail():
-    """Rows of a table each for itself: the farthest of thousands in a right twin."""
-    rng = np.random.default_rng(6)
-    rows = rng.normal(size=(400, 2000))
-    rows[0, 7] = 5.0
-    every = Pattern("sample", (0,))
+@pytest.mark.parametrize(("far", "readings"), [(5.0, 24), (5.0, 2000), (300.0, 2000)])
+def test_one_far_row_is_no_tail(far, readings):
+    """The farthest of thousands in a right twin, and one that is a mistake: by itself it is no shape of the others."""
+    rows = np.random.default_rng(6).normal(size=(400, readings))
+    rows[0, 7] = far
     for kind, function in (("tails", tails), ("skewness", skewness)):
-        scores = function(rows)
-        assert family_test(Family(kind, every, np.ones(())), scores - scores[1:].mean(0)).p_value > 1e-3
+        scores = function(rows).sum(1, keepdims=True)
+        common = Family(kind, Pattern("common", ()), np.ones(()))
+        assert family_test(common, scores - scores[1:].mean(0)).p_value > 1e-3
+
+
+@pytest.mark.parametrize(("seed", "readings"), [(0, 24), (1, 200)])
+def test_shapes_of_few_readings_are_as_rare_as_they_say(seed, readings):
+    """Sums of so many functions of a right twin's rows; 4,000 data sets against 400 others."""
+    rng, null = np.random.default_rng(seed), np.random.default_rng(10 + seed).normal(size=(400, readings))
+    for function in (skewness, tails):
+        own = function(null).sum(1)
+        deviation, mean = own.std(), own.mean()
+        sums = function(rng.normal(size=(4000, readings))).sum(1)
+        p = 2 * stats.norm.sf(np.abs(sums - mean) / deviation)
+        for level in (0.01, 0.001):
+            assert (p <= level).sum() <= stats.binom.isf(1e-4, 4000, 3 * level)
+
+
+def test_a_few_percent_that_err_to_one_side_are_noticed():
+    """Ranges of which one in fifteen came by a reflection: their ranks say little, their size says it."""
+    rng = np.random.default_rng(8)
+    error = rng.normal(size=(200, 600)) + rng.exponential(2.0, (200, 600)) * (
+        rng.uniform(size=(200, 600)) < 0.066
+    )
+    rows = (error - error.mean(1, keepdims=True)) / error.std(1, keepdims=True)
+    noticed = skewness(rows).sum(1) / np.sqrt(600)
+    ranks = (5 * (2 * ndtr(rows) - 1) ** 3 - 3 * (2 * ndtr(rows) - 1)).sum(1) / 2 * np.sqrt(7 / 600)
+    assert np.median(noticed) > 3.5
+    assert np.median(ranks) < 2.0
 
 
 def test_values_and_moments_are_told_apart():
@@ -219,18 +245,46 @@ def test_values_and_moments_are_told_apart():
 
 @pytest.mark.parametrize("shape", [skewness, tails])
 def test_what_a_mean_or_a_scale_moves_does_not_count(shape):
-    at, weight = np.polynomial.hermite_e.hermegauss(150)
-    weight /= weight.sum()
+    at = np.linspace(-12, 12, 1_000_001)
+    weight = stats.norm.pdf(at) * (at[1] - at[0])
     for moved in (1.0, at, at**2 - 1.0):
-        assert abs(np.sum(weight * moved * shape(ndtr(at)))) < 1e-6
+        assert abs(np.sum(weight * moved * shape(at))) < 1e-6
+    assert np.sum(weight * shape(at) ** 2) == pytest.approx(1.0, abs=1e-6)
+    assert np.abs(shape(np.array([-100.0, 100.0]))).max() < 12.0
 
 
 def test_shapes_have_the_sign_that_they_say():
     rng = np.random.default_rng(2)
     right = (rng.gamma(4.0, size=100_000) - 4.0) / 2.0
-    assert abs(skewness(ndtr(right)).mean() + skewness(ndtr(-right)).mean()) < 1e-12
-    assert skewness(ndtr(right)).mean() > 0.1
-    assert tails(ndtr(rng.standard_t(5, size=100_000) / np.sqrt(5 / 3))).mean() > 0.05
+    assert abs(skewness(right).mean() + skewness(-right).mean()) < 1e-12
+    assert skewness(right).mean() > 0.1
+    assert tails(rng.standard_t(5, size=100_000) / np.sqrt(5 / 3)).mean() > 0.05
+
+
+@model(cluster="user", axes={"range": ("user", "anchor"), "range_m": ("user", "anchor")})
+def ranging(distance, range_m=None):
+    """Ranges with heavy tails to both sides."""
+    spread = numpyro.sample("spread", dist.LogNormal(-1.0, 0.5))
+    bias = numpyro.sample("bias", dist.Normal(0.0, 0.5).expand([distance.shape[1]]).to_event(1))
+    users, anchors = distance.shape
+    with numpyro.plate("user", users, dim=-2), numpyro.plate("anchor", anchors, dim=-1):
+        expected = numpyro.deterministic("range", distance + bias)
+        numpyro.sample("range_m", dist.StudentT(4.0, expected, spread), obs=range_m)
+
+
+@pytest.mark.parametrize(("late", "moments"), [(0.0, set()), (0.06, {"skewness"})])
+def test_far_readings_on_one_side_are_no_heavy_tails(late, moments):
+    """A twin that knows outliers, but on both sides; of 1,200 ranges 6% are too long by a metre or so."""
+    rng = np.random.default_rng(7)
+    distance = rng.uniform(3.0, 30.0, (200, 6))
+    error = 0.3 * rng.standard_t(4, distance.shape)
+    error += rng.exponential(1.2, distance.shape) * (rng.uniform(size=distance.shape) < late)
+    problem = Problem(ranging, {"distance": distance, "range_m": jnp.asarray(distance + error)}, [])
+    fitted = fitting.fit(problem, problem.null())
+    projection = project(problem, fitted)
+    drawn = replicate(problem, fitted, projection, jax.random.key(0), Settings())
+    found = locate(problem, fitted, projection, drawn, Settings())
+    assert {f.moment for f in found.sites if f.p_value < 0.0025} & {"skewness", "tails"} == moments
 
 
 WAITING = {
