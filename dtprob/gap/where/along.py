@@ -53,7 +53,7 @@ def curves(problem: Problem, axis: str, size: int) -> tuple[Curves, ...]:
 
 def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     place = (np.arange(size) + 0.5) / size
-    yield Curves(f"smooth in {axis}", waves(place, 1, ORDER))
+    yield Curves(f"smooth in {axis}", waves(place, 1, ORDER), simple=True)
     yield from ripples(axis, place, _FINEST)
     found = columns(problem, axis, size)
     made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}

@@ -49,6 +49,7 @@ class Curves:
         ripple: of a band of ripples, what they are along.
         column: of groups of positions, the column of the data that makes them.
         plain: whether they follow a column, which the user knows by name, and not positions alone.
+        simple: whether they are what most causes do: smooth along one axis or column, or by the groups of one.
         overlaps: whether they tell the same many times over: their largest score says where, but their sum says nothing.
         places: where each of them lies, in words, of those that lie somewhere.
     """
@@ -58,6 +59,7 @@ class Curves:
     ripple: Ripple | None = None
     column: str | None = None
     plain: bool = False
+    simple: bool = False
     overlaps: bool = False
     places: tuple[str, ...] = ()
 
@@ -81,7 +83,7 @@ class Curves:
 def by_group(name: str, index: np.ndarray, column: np.ndarray) -> Curves:
     """By the groups (size,) that a column makes of positions."""
     places = groups_in_words(index, {name: column})
-    return Curves(f"by {name}", grouped(index), column=name, plain=True, places=places)
+    return Curves(f"by {name}", grouped(index), column=name, plain=True, simple=True, places=places)
 
 
 def grouped(index: np.ndarray) -> sparse.csr_matrix:
@@ -115,7 +117,7 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
 
 def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     """Smooth over a column (size,), beyond values that part its ranks into equal shares, and ripples over them."""
-    yield Curves(f"along {name}", _smooth(column), plain=True)
+    yield Curves(f"along {name}", _smooth(column), plain=True, simple=True)
     cuts = np.unique(np.quantile(column, np.arange(1, _SHARES) / _SHARES))
     steps = np.where(column > cuts[:, None], 0.5, -0.5)
     places = tuple(f"beyond {cut:.4g} of {name}" for cut in cuts)

@@ -94,6 +94,11 @@ class Family:
         """In words."""
         return f"{self.kind}, {self.pattern.label}"
 
+    @property
+    def is_simple(self) -> bool:
+        """Whether it is what most causes do: along axes, smooth along one axis or column, or by the groups of one."""
+        return self.pattern.curves is None or self.pattern.curves.simple
+
     def step(self, scores: np.ndarray, variance: np.ndarray, value: np.ndarray) -> np.ndarray:
         """The perturbation of the site that scores (entry,) point to, of the site's shape and dtype."""
         floor = 1e-12 * max(float(variance.max(initial=0.0)), 1e-300)

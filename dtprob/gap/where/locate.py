@@ -22,7 +22,6 @@ from dtprob.gap.model.conditioned import conditioned
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
-from dtprob.gap.tails import family_wise
 from dtprob.gap.where.along import curves
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
 from dtprob.gap.where.data_columns import all_columns, whole_columns
@@ -31,6 +30,7 @@ from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, 
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.foremost import foremost
 from dtprob.gap.where.gains import gains
+from dtprob.gap.where.in_all import InAll
 from dtprob.gap.where.moments import further_moments
 from dtprob.gap.where.quantities import Quantity, cells, groups, quantity, together
 from dtprob.gap.where.repeats import repeats
@@ -195,13 +195,12 @@ def _test_sites(
     noise = drawn.rows if centre is None else centre.without_own(drawn.rows)  # no tail of own unknowns' prior
     for name, family, scores in further_moments(problem, fitted.x, noise):
         beyond.setdefault(name, []).append(family_test(family, scores))
-    null = [test.null for tests in (*(tests for _, tests in tested), *beyond.values()) for test in tests]
-    smallest = np.stack(null, axis=1).min(axis=1) if null else np.ones(1)
+    in_all = InAll.of([t for tests in (*(own for _, own in tested), *beyond.values()) for t in tests])
     findings = [
-        _finding(problem, fitted, projection, drawn, site=site, tests=tests, smallest=smallest)
+        _finding(problem, fitted, projection, drawn, site=site, tests=tests, in_all=in_all)
         for site, tests in tested
     ]
-    further = [_beyond(name, tests, smallest) for name, tests in beyond.items()]
+    further = [_beyond(name, tests, in_all) for name, tests in beyond.items()]
     return _Tested(tested, findings, [*further, *ways.repeated])
 
 
@@ -249,11 +248,10 @@ def _energy(problem: Problem, drawn: Replicates) -> float:
     return float(energy[0] / max(energy[1:].mean(), 1e-300))
 
 
-def _beyond(name: str, tests: Sequence[FamilyTest], smallest: np.ndarray) -> SiteFinding:
+def _beyond(name: str, tests: Sequence[FamilyTest], in_all: InAll) -> SiteFinding:
     """The further moment of an observation with the smallest p-value; nothing that a fit could move stands for it."""
     best = min(tests, key=lambda test: test.p_value)
-    p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
-    return SiteFinding(name, best.family.label, p_value, None)
+    return SiteFinding(name, best.family.label, in_all.p_value(best), None)
 
 
 def _each(test: FamilyTest) -> float:
@@ -270,15 +268,15 @@ def _finding(
     *,
     site: Site,
     tests: Sequence[FamilyTest],
-    smallest: np.ndarray,
+    in_all: InAll,
 ) -> SiteFinding:
     """The smallest p-value of a site's families, with the gain along that family's steepest direction."""
-    best = min(tests, key=lambda test: (test.p_value, -_each(test)))
+    best = min(tests, key=lambda test: (in_all.p_value(test), test.p_value, -_each(test)))
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
     gain = gains(drawn.rows[: 1 + CHANCE], shifts, problem.rows.is_spread)
     net = max(float(gain[0] - gain[1:].mean()), 0.0)
-    p_value = float(family_wise(np.array([best.p_value]), smallest)[0])
+    p_value = in_all.p_value(best)
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
     score = max(map(_each, tests))
