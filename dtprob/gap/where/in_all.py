@@ -1,8 +1,8 @@
 """P-values of many families of sites together, half the chance of an error kept for the few that are what most causes do.
 
 Among thousands of ways to be wrong, one that most causes take would need a p-value of 1e-6 to count. With weights given
-beforehand (Genovese, Roeder and Wasserman, Biometrika 93 (2006) 509) it needs 1e-4, and each of the others half of what it
-needed.
+beforehand (Genovese, Roeder and Wasserman, Biometrika 93 (2006) 509) it needs 1e-4. Half of the whole level is kept back:
+p-values so small are those of a law that replicates tell the middle of.
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from dtprob.gap.where.family_test import FamilyTest
 
 _GROUPS: Final = (True, False)
 """What is simple, and what is not."""
+_KEPT_BACK: Final = 2.0
+"""Times that a p-value has to be smaller than the replicates say."""
 
 
 class InAll(NamedTuple):
@@ -37,4 +39,4 @@ class InAll(NamedTuple):
     def p_value(self, test: FamilyTest) -> float:
         """Family-wise over all tests."""
         own = any_of(np.array(test.p_value), self.tests[test.family.is_simple])
-        return float(any_of(own, len(self.tests)))
+        return float(any_of(own, _KEPT_BACK * len(self.tests)))

@@ -21,8 +21,9 @@ from dtprob.gap.tails import family_wise
 from dtprob.gap.where.bounded import skewness, tails
 from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import family_test
+from dtprob.gap.where.kinds import moment
 from dtprob.gap.where.locate import locate
-from dtprob.gap.where.moments import _delayed, further_moments, moment
+from dtprob.gap.where.moments import _delayed, further_moments
 from dtprob.gap.where.site_finding import SiteFinding, likely_left, most_left
 from dtprob.models.declaration import model
 
