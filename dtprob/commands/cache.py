@@ -11,7 +11,7 @@ from typing import Final
 import jax
 
 LARGEST: Final = 1 << 30
-"""Bytes that the folder may hold at the start of a command; the oldest programs go first."""
+"""Bytes that the folder may hold at the start of a command; what was used longest ago goes first."""
 
 
 def keep_compiled() -> None:
@@ -35,10 +35,10 @@ def cache_folder() -> Path:
 
 
 def prune(folder: Path, largest: int) -> None:
-    """Delete the oldest files of a folder until the others take at most so many bytes."""
+    """Delete the files of a folder that were used longest ago until the others take at most so many bytes."""
     if not folder.is_dir():
         return
-    files = sorted(_files(folder), key=lambda found: found[0].st_mtime)
+    files = sorted(_files(folder), key=lambda found: max(found[0].st_mtime, found[0].st_atime))
     total = sum(stat.st_size for stat, _ in files)
     for stat, path in files:
         if total <= largest:

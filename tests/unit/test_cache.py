@@ -18,6 +18,14 @@ def test_the_oldest_programs_go_first(tmp_path):
     assert sorted(file.name for file in tmp_path.iterdir()) == ["middle", "new"]
 
 
+def test_an_old_program_that_is_still_used_stays(tmp_path):
+    for age, name in enumerate(["new", "unused", "used"]):
+        (tmp_path / name).write_bytes(bytes(100))
+        os.utime(tmp_path / name, (1e9 + 9 if name == "used" else 1e9 - age, 1e9 - age))
+    cache.prune(tmp_path, 250)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["new", "used"]
+
+
 def test_a_folder_that_is_not_there_yet_is_no_error(tmp_path):
     cache.prune(tmp_path / "none", 0)
 

@@ -179,6 +179,17 @@ def test_what_is_left_is_told_as_it_is_wrong() -> None:
     assert next_look(report).endswith("Look for what could cause the dependence of the delay on RSS.")
 
 
+@pytest.mark.parametrize(
+    ("kind", "hint"),
+    [("skewness", "err to one side"), ("dispersion", "a schedule"), ("tails", "farther off")],
+)
+def test_what_makes_a_law_wrong_is_hinted_at(kind: str, hint: str) -> None:
+    report = _unlisted({"site": "delay", "p_value": 1e-9, "share": None, "family": f"{kind}, common"})
+    assert f"the {kind} of the delay" in tell(report).headline + tell(report).meaning
+    assert f"change the {kind} of the delay (" in next_look(report)
+    assert hint in next_look(report)
+
+
 def test_a_value_that_is_wrong_calls_for_physics() -> None:
     values: names.Site = {"site": "range", "p_value": 1e-9, "share": 0.5, "family": "additive, common"}
     spread: names.Site = {"site": "y", "p_value": 1e-3, "share": None, "family": "spread, by wall"}

@@ -23,7 +23,7 @@ from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import family_test
 from dtprob.gap.where.kinds import moment
 from dtprob.gap.where.locate import locate
-from dtprob.gap.where.moments import _delayed, further_moments
+from dtprob.gap.where.moments import _delayed, _kept, further_moments
 from dtprob.gap.where.site_finding import SiteFinding, likely_left, most_left
 from dtprob.models.declaration import model
 
@@ -286,6 +286,54 @@ def test_far_readings_on_one_side_are_no_heavy_tails(late, moments):
     drawn = replicate(problem, fitted, projection, jax.random.key(0), Settings())
     found = locate(problem, fitted, projection, drawn, Settings())
     assert {f.moment for f in found.sites if f.p_value < 0.0025} & {"skewness", "tails"} == moments
+
+
+@model(cluster="cell", axes={"log_rate": ("cell", "hour"), "packets": ("cell", "hour")})
+def counted(load, packets=None):
+    """Packets at a rate that grows with the load."""
+    level = numpyro.sample("level", dist.Normal(2.0, 2.0))
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    cells, hours = load.shape
+    with numpyro.plate("cell", cells, dim=-2), numpyro.plate("hour", hours, dim=-1):
+        log_rate = numpyro.deterministic("log_rate", level + slope * load)
+        numpyro.sample("packets", dist.Poisson(jnp.exp(log_rate)), obs=packets)
+
+
+@pytest.mark.parametrize(
+    ("spread", "site", "expected"),
+    [(0.5, "packets", "dispersion"), (1.0, None, None), (1.4, "log_rate", None)],
+)
+def test_counts_that_are_more_even_than_chance_are_noticed_and_wider_ones_show_at_their_rate(
+    spread, site, expected
+):
+    rng = np.random.default_rng(9)
+    load = rng.normal(size=(20, 20))
+    mean = np.exp(2.5 + 0.3 * load)
+    packets = np.maximum(np.round(mean + spread * np.sqrt(mean) * rng.normal(size=mean.shape)), 0.0)
+    problem = Problem(counted, {"load": load, "packets": jnp.asarray(packets, int)}, [])
+    fitted = fitting.fit(problem, problem.null())
+    projection = project(problem, fitted)
+    drawn = replicate(problem, fitted, projection, jax.random.key(0), Settings())
+    first = locate(problem, fitted, projection, drawn, Settings()).sites[0]
+    if site is None:
+        assert first.p_value > 0.05
+    else:
+        assert (first.site, first.moment) == (site, expected)
+        assert first.p_value < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("shape", "kept"),
+    [
+        ((30, 40), [(), (0,), (1,)]),
+        ((30, 20), [(), (1,)]),
+        ((24, 1), [()]),
+        ((2, 12), [()]),
+        ((2, 11), []),
+    ],
+)
+def test_shapes_are_pooled_over_24_readings_or_more(shape, kept):
+    assert list(_kept(shape, 24)) == kept
 
 
 WAITING = {
