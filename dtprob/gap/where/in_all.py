@@ -1,8 +1,8 @@
 """P-values of many families of sites together, half the chance of an error kept for the few that are what most causes do.
 
 Among thousands of ways to be wrong, one that most causes take would need a p-value of 1e-6 to count. With weights given
-beforehand (Genovese, Roeder and Wasserman, Biometrika 93 (2006) 509) it needs 1e-4. Half of the whole level is kept back:
-p-values so small are those of a law that replicates tell the middle of.
+beforehand (Genovese, Roeder and Wasserman, Biometrika 93 (2006) 509) it needs 1e-4. Half of the whole level is kept back,
+since p-values so small are extrapolated: replicates tell the middle of their law.
 """
 
 from __future__ import annotations

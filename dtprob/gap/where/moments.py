@@ -33,8 +33,10 @@ _TOLD: Final = 3.3
 """The same, told by the rows' own kurtosis and the number of products."""
 _LEAST: Final = 1e-12
 """Probabilities are kept so far from zero and one."""
+_OF_FAR_ONES: Final = ("skewness", "tails", "dispersion")
+"""What the readings that are far out mostly tell."""
 _POOLED: Final = 24
-"""Readings that skewness and tails are pooled over, at least: so many have sums that are nearly normal."""
+"""Readings that these are pooled over, at least: so many have sums that are nearly normal."""
 _OUTPUTS: Final = 8
 """Entries of a last axis up to which each pair is looked at."""
 _LATEST: Final = 4
@@ -75,10 +77,8 @@ def further_moments(
             n: r for n, r in products.items() if n > name and problem.declaration.observed[n].axes == axes
         }
         shape = _shape(known, observations[name].parameters, row[:, 0], every[name])
-        pooled = [(kind, values, _POOLED) for kind, values in shape]
-        pooled += [(kind, values, 1) for kind, values in _dependence(products[name], axes, others)]
-        for kind, values, least in pooled:
-            for kept in _kept(values.shape[1:], least):
+        for kind, values in itertools.chain(shape, _dependence(products[name], axes, others)):
+            for kept in _kept(values.shape[1:], _POOLED if kind in _OF_FAR_ONES else 1):
                 scores = _pooled(values, kept)
                 if kind == "dispersion":  # what is spread more shows where values are, entry by entry
                     scores[0] = np.minimum(scores[0], 0.0)
@@ -120,7 +120,8 @@ def _shape(
         yield "tails", tails(row)
     elif known.probability is not None:
         smaller = known.probability(parameters, jnp.asarray(np.moveaxis(every, 1, 0)))
-        score = ndtri(np.clip(np.asarray(smaller, float), _LEAST, 1 - _LEAST))
+        chance = np.nan_to_num(np.asarray(smaller, float), nan=0.5)  # what is masked may have no parameters
+        score = ndtri(np.clip(chance, _LEAST, 1 - _LEAST))
         told = scored(every, is_normal=False)
         yield "skewness", beside(skewness(score), told)
         yield "tails", beside(tails(score), told)

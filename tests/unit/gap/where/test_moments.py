@@ -16,6 +16,7 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bootstrap import more, replicate
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.observation.likelihoods import likelihood
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import family_wise
 from dtprob.gap.where.bounded import skewness, tails
@@ -23,7 +24,7 @@ from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import family_test
 from dtprob.gap.where.kinds import moment
 from dtprob.gap.where.locate import locate
-from dtprob.gap.where.moments import _delayed, _kept, further_moments
+from dtprob.gap.where.moments import _delayed, _kept, _shape, further_moments
 from dtprob.gap.where.site_finding import SiteFinding, likely_left, most_left
 from dtprob.models.declaration import model
 
@@ -320,6 +321,14 @@ def test_counts_that_are_more_even_than_chance_are_noticed_and_wider_ones_show_a
     else:
         assert (first.site, first.moment) == (site, expected)
         assert first.p_value < 1e-3
+
+
+def test_what_is_masked_and_has_no_parameters_tells_nothing():
+    rows = np.random.default_rng(3).normal(size=(50, 1, 40))
+    rows[..., 5] = 0.0
+    rate = np.where(np.arange(40) == 5, np.nan, 4.0)
+    for _, values in _shape(likelihood("Poisson"), {"rate": jnp.asarray(rate)}, rows[:, 0], rows):
+        assert np.isfinite(values).all()
 
 
 @pytest.mark.parametrize(
