@@ -37,6 +37,9 @@ _OF_FAR_ONES: Final = ("skewness", "tails", "dispersion")
 """What the readings that are far out mostly tell."""
 _POOLED: Final = 24
 """Readings that these are pooled over, at least: so many have sums that are nearly normal."""
+_FREE: Final = 0.9
+"""Share of their variance that unknowns leave to readings, at least, whose evenness tells something: states of their own make
+counts as even as these are free."""
 _OUTPUTS: Final = 8
 """Entries of a last axis up to which each pair is looked at."""
 _LATEST: Final = 4
@@ -125,7 +128,7 @@ def _shape(
         told = scored(every, is_normal=False)
         yield "skewness", beside(skewness(score), told)
         yield "tails", beside(tails(score), told)
-        if known.located is None:
+        if known.located is None and np.mean(row[1:] ** 2) > _FREE:
             yield "dispersion", beside(dispersion(score), told)
 
 
