@@ -37,9 +37,11 @@ _OF_FAR_ONES: Final = ("skewness", "tails", "dispersion")
 """What the readings that are far out mostly tell."""
 _POOLED: Final = 24
 """Readings that these are pooled over, at least: so many have sums that are nearly normal."""
+_NOTHING: Final = 1e-12
+"""Variance of what does not count."""
 _FREE: Final = 0.9
-"""Share of their variance that unknowns leave to readings, at least, whose evenness tells something: states of their own make
-counts as even as these are free."""
+"""Share of their variance that unknowns leave to readings that are not normal, at least, for their shape to be looked at:
+states of their own make counts even, and by more than a linear fit tells."""
 _OUTPUTS: Final = 8
 """Entries of a last axis up to which each pair is looked at."""
 _LATEST: Final = 4
@@ -121,15 +123,22 @@ def _shape(
     elif known.log_scale is not None:
         yield "skewness", skewness(row)
         yield "tails", tails(row)
-    elif known.probability is not None:
+    elif known.probability is not None and _freedom(row[1:]) > _FREE:
         smaller = known.probability(parameters, jnp.asarray(np.moveaxis(every, 1, 0)))
         chance = np.nan_to_num(np.asarray(smaller, float), nan=0.5)  # what is masked may have no parameters
         score = ndtri(np.clip(chance, _LEAST, 1 - _LEAST))
         told = scored(every, is_normal=False)
         yield "skewness", beside(skewness(score), told)
         yield "tails", beside(tails(score), told)
-        if known.located is None and np.mean(row[1:] ** 2) > _FREE:
+        if known.located is None:
             yield "dispersion", beside(dispersion(score), told)
+
+
+def _freedom(rows: np.ndarray) -> float:
+    """Share of their variance that rows (replicate, *entry) keep, on average over the entries that count."""
+    variance = (rows**2).mean(axis=0)
+    counts = variance > _NOTHING
+    return float(variance[counts].mean()) if counts.any() else 0.0
 
 
 def _dependence(

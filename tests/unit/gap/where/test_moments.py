@@ -327,8 +327,14 @@ def test_what_is_masked_and_has_no_parameters_tells_nothing():
     rows = np.random.default_rng(3).normal(size=(50, 1, 40))
     rows[..., 5] = 0.0
     rate = np.where(np.arange(40) == 5, np.nan, 4.0)
-    for _, values in _shape(likelihood("Poisson"), {"rate": jnp.asarray(rate)}, rows[:, 0], rows):
-        assert np.isfinite(values).all()
+    found = dict(_shape(likelihood("Poisson"), {"rate": jnp.asarray(rate)}, rows[:, 0], rows))
+    assert set(found) == {"skewness", "tails", "dispersion"}
+    assert all(np.isfinite(values).all() for values in found.values())
+
+
+def test_counts_that_states_of_their_own_follow_have_no_shape():
+    rows = 0.8 * np.random.default_rng(3).normal(size=(50, 1, 40))
+    assert not list(_shape(likelihood("Poisson"), {"rate": jnp.full(40, 4.0)}, rows[:, 0], rows))
 
 
 @pytest.mark.parametrize(
