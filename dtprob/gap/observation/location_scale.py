@@ -8,19 +8,19 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
 import numpyro.distributions as dist
 
+from dtprob.gap.observation import probabilities
 from dtprob.gap.observation.likelihood import Likelihood
 from dtprob.gap.observation.residuals import EULER, Parameters
 
 _NEAR: Final = 0.9
 """Psi up to which it tells the value; it ends at 1."""
-_FARTHEST: Final = 2.0 - 1e-12
-"""Largest psi times value of a Cauchy distribution that tells a size; it ends at 2."""
 
 
 def _location_scale(
@@ -80,13 +80,6 @@ def _logistic(psi: jax.Array, size: jax.Array) -> jax.Array:
     return jax.nn.sigmoid(jnp.where(jnp.abs(psi) < _NEAR, near, far))
 
 
-def _cauchy(psi: jax.Array, size: jax.Array) -> jax.Array:
-    """Far values turn back in psi, which tells their sign, and have their size from its product with the value."""
-    left = 2.0 - jnp.clip(size, 0.0, _FARTHEST)
-    far = jnp.sign(psi) * jnp.sqrt(jnp.maximum(size, 0.0) / left)
-    return 0.5 + jnp.arctan(jnp.where(size < 1.0, psi / left, far)) / math.pi
-
-
 def _gumbel(psi: jax.Array, size: jax.Array) -> jax.Array:
     """Psi tells all values but the largest, of which it is 1."""
     near, far = -jnp.log1p(-jnp.minimum(psi, _NEAR)), size / jnp.clip(psi, _NEAR, 1.0)
@@ -96,7 +89,9 @@ def _gumbel(psi: jax.Array, size: jax.Array) -> jax.Array:
 LOGISTIC: Final = _location_scale(
     dist.Logistic, lambda r: jnp.tanh(r / 2), (1 / 3, (3 + math.pi**2) / 9, 0.0), _logistic
 )
-CAUCHY: Final = _location_scale(dist.Cauchy, lambda r: 2 * r / (1 + r**2), (0.5, 0.5, 0.0), _cauchy)
+CAUCHY: Final = _location_scale(
+    dist.Cauchy, lambda r: 2 * r / (1 + r**2), (0.5, 0.5, 0.0), partial(probabilities.of_slope, df=1.0)
+)
 GUMBEL: Final = _location_scale(
     dist.Gumbel, lambda r: -jnp.expm1(-r), (1.0, (1 - EULER) ** 2 + math.pi**2 / 6, EULER - 1), _gumbel
 )

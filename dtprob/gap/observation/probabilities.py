@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.special import betainc, digamma, erf, gammainc, gammaincc
+from jax.typing import ArrayLike
 from scipy import stats
 
 from dtprob.gap.observation.discrete import counts_deviation
@@ -62,12 +63,21 @@ def beta(p: Parameters, rows: jax.Array) -> jax.Array:
 
 
 def student(p: Parameters, rows: jax.Array) -> jax.Array:
-    """Of a Student t distribution: far values turn back in the first row, which tells their sign, the second their size."""
+    """Of a Student t distribution."""
     v = p["df"]
-    size = jnp.clip(1.0 + student_information(v)[0] * rows[1], 0.0, (1.0 - _END) * (v + 1.0))
-    near = rows[0] * jnp.sqrt((v + 1.0) / (v + 3.0)) * v / (v + 1.0 - size)
-    far = jnp.sign(rows[0]) * jnp.sqrt(v * size / (v + 1.0 - size))
-    r = jnp.where(size < 1.0, near, far)
+    slope = rows[0] * jnp.sqrt((v + 1.0) / (v + 3.0))
+    return of_slope(slope, 1.0 + student_information(v)[0] * rows[1], v)
+
+
+def of_slope(slope: jax.Array, size: jax.Array, df: ArrayLike) -> jax.Array:
+    """Of a Student t distribution, from the slope of its log density, (v + 1) r / (v + r^2), and that times the value r.
+
+    Far values turn back in the slope, which tells their sign, and have their size from the product.
+    """
+    v = jnp.asarray(df)
+    size = jnp.clip(size, 0.0, (1.0 - _END) * (v + 1.0))
+    left = v / (v + 1.0 - size)
+    r = jnp.where(size < 1.0, slope * left, jnp.sign(slope) * jnp.sqrt(size * left))
     beyond = 0.5 * betainc(v / 2.0, 0.5, v / (v + r**2))
     return jnp.where(r > 0, 1.0 - beyond, beyond)
 

@@ -14,9 +14,10 @@ from scipy import stats
 
 _BESIDE: Final = 2
 """Counts on each side that tell how often one is."""
-_FEWEST: Final = 5
-_TIMES: Final = 1.5
-"""How often a count is seen at least, and times what is expected, to stand out."""
+FEWEST: Final = 5
+"""Times that a value is seen from which on it is looked at."""
+TIMES: Final = 1.5
+"""Times what is expected that it is seen at least."""
 MOST: Final = 4096
 """Counts from the smallest to the largest that are looked at, at most."""
 
@@ -40,7 +41,7 @@ def count_piles(
     by_twin = expected * np.maximum(np.max(more, axis=0), 1.0)
     least = np.max([np.ones(len(seen)), by_twin, seen_at[-1], seen_at[1], *series], axis=0)
     tail = stats.poisson.sf(seen - 1, least)
-    return np.where((seen >= _FEWEST) & (seen >= _TIMES * least), tail, 1.0)
+    return np.where((seen >= FEWEST) & (seen >= TIMES * least), tail, 1.0)
 
 
 def _shifted(values: np.ndarray, by: int) -> np.ndarray:

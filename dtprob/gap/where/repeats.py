@@ -22,17 +22,13 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.model.quick import quick_jit
 from dtprob.gap.observation import whiten
 from dtprob.gap.observation.likelihoods import is_continuous, is_discrete, likelihood
-from dtprob.gap.where.count_piles import MOST, count_piles
+from dtprob.gap.where.count_piles import FEWEST, MOST, TIMES, count_piles
 from dtprob.gap.where.site_finding import SURE, SiteFinding
 
-_FEWEST: Final = 5
-"""Readings that are alike from which on they are looked at."""
 _BESIDE: Final = 4
 """Distinct values on each side of which the one that is read most often tells how often one is."""
 _OFTEN: Final = 0.25
 """Share of neighbours that are alike up to which a run of one value tells something: slow errors, rounded, stay long."""
-_TIMES: Final = 1.5
-"""Times what is expected that a value is read at least."""
 _MOST: Final = 64
 """Values of one observation that are looked at, those that are read most often."""
 
@@ -69,7 +65,7 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
 def _readings(observed: whiten.Observation, values: np.ndarray, counted: np.ndarray) -> list[_Repeated]:
     """The value that is read most surely too often, and the runs of one value, the surest first."""
     distinct, count = np.unique(values[counted], return_counts=True)
-    if len(distinct) < 2 or count.max() < _FEWEST:
+    if len(distinct) < 2 or count.max() < FEWEST:
         return []
     apart = _entries_apart(observed)
     alike = {i: _alike(values, counted, i) for i in range(values.ndim) if values.shape[i] > 1}
@@ -108,12 +104,12 @@ def _pile(
     So many readings count as one: where errors go together, so do those that are alike, and they come back together.
     """
     often = np.argsort(-count)[:_MOST]
-    often = often[count[often] >= _FEWEST]
+    often = often[count[often] >= FEWEST]
     at, room = distinct[often], _room(distinct)[often]
     by_twin = _expected(observed.parameters, at, room, family=observed.family, shape=shape)
     expected = np.maximum(np.maximum(_beside(count)[often], by_twin), 1.0)
     tail = stats.poisson.sf(np.floor(count[often] / together) - 1, expected / together)
-    tail[count[often] < _TIMES * expected] = 1.0
+    tail[count[often] < TIMES * expected] = 1.0
     worst = int(np.argmin(tail))
     return _Repeated(at[worst], f"{count[often][worst]} times", float(len(distinct) * tail[worst]))
 
@@ -128,7 +124,7 @@ def _runs(
             length[i + 1] = np.where(again, length[i] + 1, 0)
         steps = int(length.max())
         elsewhere = (same.sum() - steps + 1) / (same.size - steps + 1)
-        if steps + 1 < _FEWEST or elsewhere > _OFTEN:
+        if steps + 1 < FEWEST or elsewhere > _OFTEN:
             continue
         end, *beside = np.unravel_index(int(length.argmax()), length.shape)
         run = (slice(end - steps + 1, end + 1), *beside)
