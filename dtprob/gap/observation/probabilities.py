@@ -72,12 +72,10 @@ def student(p: Parameters, rows: jax.Array) -> jax.Array:
 def of_slope(slope: jax.Array, size: jax.Array, df: ArrayLike) -> jax.Array:
     """Of a Student t distribution, from the slope of its log density, (v + 1) r / (v + r^2), and that times the value r.
 
-    Far values turn back in the slope, which tells their sign, and have their size from the product.
+    Far values turn back in the slope; the product, which ends at v + 1, tells them.
     """
     v = jnp.asarray(df)
-    size = jnp.clip(size, 0.0, (1.0 - _END) * (v + 1.0))
-    left = v / (v + 1.0 - size)
-    r = jnp.where(size < 1.0, slope * left, jnp.sign(slope) * jnp.sqrt(size * left))
+    r = slope * v / (v + 1.0 - jnp.clip(size, 0.0, (1.0 - _END) * (v + 1.0)))
     beyond = 0.5 * betainc(v / 2.0, 0.5, v / (v + r**2))
     return jnp.where(r > 0, 1.0 - beyond, beyond)
 

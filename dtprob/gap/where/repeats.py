@@ -157,8 +157,7 @@ def _chance(
     """The chance of each reading, in the shape of all, to be rounded to a value of such a width; 0 where none counts."""
     observed = whiten.Observation(family, parameters)
     density = jnp.exp(whiten.log_prob(observed, jnp.full(shape, value)))
-    density = jnp.where(value > parameters.get("total_count", jnp.inf), 0.0, jnp.nan_to_num(density))
-    return observed.masked(jnp.minimum(density * room, 1.0))
+    return observed.masked(jnp.minimum(jnp.nan_to_num(density) * room, 1.0))
 
 
 _chances: Final = quick_jit(_chance, static_argnames=("family", "shape"))

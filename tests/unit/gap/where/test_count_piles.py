@@ -60,6 +60,14 @@ def test_rates_that_are_wrong_make_no_pile(factor):
     assert (np.array(wrong) <= SURE).sum() <= 3
 
 
+def test_a_series_that_goes_on_is_no_pile():
+    """Each count half as often as the one before, though the twin knows of none of the first ones."""
+    seen = np.array([64.0, 32.0, 16.0, 8.0, 4.0, 2.0, 1.0])
+    assert count_piles(seen, np.full(7, 2.0)).min() == 1.0
+    seen[0] += 40.0
+    assert count_piles(seen, np.full(7, 2.0))[0] < 1e-3
+
+
 def arrivals(load, sent=None, arrived=None):
     """Packets at a rate that grows with the load; of so many that were sent, if that is known."""
     level = numpyro.sample("level", dist.Normal(0.0, 3.0))

@@ -315,12 +315,33 @@ def test_counts_that_are_more_even_than_chance_are_noticed_and_wider_ones_show_a
     fitted = fitting.fit(problem, problem.null())
     projection = project(problem, fitted)
     drawn = replicate(problem, fitted, projection, jax.random.key(0), Settings())
-    first = locate(problem, fitted, projection, drawn, Settings()).sites[0]
+    found = locate(problem, fitted, projection, drawn, Settings()).sites
+    first = found[0]
+    assert (min(f.p_value for f in found if f.moment != "dispersion") < 1e-3) == (site == "log_rate")
+    scores = {
+        f.label: s for n, f, s in further_moments(problem, fitted.x, drawn.rows) if f.kind == "dispersion"
+    }
+    assert (scores["dispersion, common"][0] == 0) == (spread > 1)
     if site is None:
         assert first.p_value > 0.05
     else:
         assert (first.site, first.moment) == (site, expected)
         assert first.p_value < 1e-3
+
+
+def test_no_shape_is_told_by_a_few_readings():
+    """Of ten users with six anchors each the shapes of all and of none alone."""
+    rng = np.random.default_rng(7)
+    distance = rng.uniform(3.0, 30.0, (10, 6))
+    data = {"distance": distance, "range_m": jnp.asarray(distance + 0.3 * rng.standard_t(4, distance.shape))}
+    problem = Problem(ranging, data, [])
+    rows = rng.normal(size=(20, *problem.compiled.residual(problem.null()).shape))
+    told = [family.label for _, family, _ in further_moments(problem, problem.null(), rows)]
+    assert [label for label in told if "skewness" in label or "tails" in label] == [
+        "skewness, common",
+        "tails, common",
+    ]
+    assert "dependence along anchor, user" in told
 
 
 def test_what_is_masked_and_has_no_parameters_tells_nothing():
