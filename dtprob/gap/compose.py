@@ -256,7 +256,7 @@ def _fit(evidence: Evidence, key: jax.Array) -> dict[str, Any]:
 def _contraction(evidence: Evidence) -> Mapping[str, np.ndarray]:
     """1 - posterior variance / prior variance of each global nuisance, in unconstrained coordinates."""
     problem, fitted = evidence.problem, evidence.base
-    deviation = problem.prior_middle[1].copy()
+    deviation = problem.prior_spread.deviation.copy()
     for names, (_, precision) in problem.known.items():
         deviation[problem.layout.indices(names)] = np.sqrt(np.diag(np.linalg.inv(precision)))
     change = np.zeros(problem.dimension)

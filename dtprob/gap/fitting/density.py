@@ -182,7 +182,7 @@ def farthest(problem: Problem) -> Float[np.ndarray, " dimension"]:
 
     Where a likelihood is flat, as of a logarithm at minus infinity, or at the end of a uniform prior, nothing leads back.
     """
-    deviation = problem.prior_middle[1]  # of the base model's unknowns, which are the first ones
+    deviation = problem.prior_spread.deviation  # of the base model's unknowns, which are the first ones
     longest = np.full(problem.dimension, np.inf)
     count = sum(block.index.size for block in problem.blocks_of(None))
     longest[:count] = np.where(deviation[:count] > 0, _FARTHEST * deviation[:count], np.inf)

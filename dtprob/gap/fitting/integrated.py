@@ -54,7 +54,7 @@ def based(problem: Problem, key: jax.Array, *, polished: int = 3, say: Say = lam
     shared, has_states = held(problem), bool(states(problem).blocks)
     if not (has_states or activate(problem).local_index.shape[1]) or not len(shared):
         return Start(problem, fit_base(problem, key, polished=polished))
-    centre, free = turned(problem, problem.prior_middle[0], problem.compiled.by_cluster), around(problem)
+    centre, free = turned(problem, problem.prior_spread.middle, problem.compiled.by_cluster), around(problem)
     starts = [centre, *unwound(problem, centre)]
     at_once = has_states or each_has_states(problem)
     if not at_once and not _runs_away(problem, fit(problem, centre), centre, free):

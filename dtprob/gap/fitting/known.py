@@ -85,15 +85,15 @@ def _skewed(
     known = {name for names in problem.known for name in names}
     base = [b for b in active.blocks if b.owner is None and b.name not in known and not _is_heavy(problem, b)]
     at = np.unique(np.concatenate([b.index.reshape(-1) for b in base])) if base else np.zeros(0, int)
-    at = at[alone[at] & (np.abs(slope[at]) * problem.prior_middle[1][at] > _LEVEL)]
+    at = at[alone[at] & (np.abs(slope[at]) * problem.prior_spread.deviation[at] > _LEVEL)]
     at = at[np.abs(curvature[at]) > _FAINT * told[at]]
-    middle, spread = (part[at] for part in problem.prior_middle)
+    middle, spread = problem.prior_spread.middle[at], problem.prior_spread.deviation[at]
     with np.errstate(divide="ignore", invalid="ignore"):
         here = 1 / np.sqrt(curvature[at])
         centre = x[at] + slope[at] * here**2
         is_normal = np.maximum(np.abs(centre - middle), np.abs(here - spread)) < _ALIKE * spread
     at, here = at[~is_normal], here[~is_normal]
-    drawn = np.abs(problem.prior_score(x, at))
+    drawn = np.abs(problem.prior_spread.score(x, at))
     score = np.maximum(drawn, _NEAR)
     is_near = np.abs(slope[at]) * here < (1 + _ALIKE) * score
     wrong = ~is_near & (drawn < _FARTHEST)
@@ -133,7 +133,7 @@ def _heavy_tailed(
     index = np.unique(np.concatenate([i.reshape(-1) for i in own]))
     centre = x.copy()
     centre[index] = 0.0
-    spread = problem.prior_middle[1][index]
+    spread = problem.prior_spread.deviation[index]
     level = np.abs(problem.compiled.prior(centre, directions)[0][index]) * spread < _LEVEL
     away = level & (np.abs(x[index]) > _LEVEL * spread)
     found[index[away]] = -slope[index[away]] / x[index[away]]

@@ -81,7 +81,7 @@ class Around:
 def around(problem: Problem, names: Sequence[str] = ()) -> Around:
     """The base model's shared unknowns, and after them the parameters of mean effects."""
     index = [held(problem)]
-    scale = [np.maximum(problem.prior_middle[1][index[0]], 1e-12)]
+    scale = [np.maximum(problem.prior_spread.deviation[index[0]], 1e-12)]
     lowest = [np.full(len(index[0]), -np.inf)]
     for effect in (e for e in problem.live if e.name in names):
         index.append(problem.layout.of(effect))

@@ -37,7 +37,7 @@ def mirrored(problem: Problem, x: Float[np.ndarray, " dimension"]) -> list[Float
     directions = own_basis(problem, activate(problem)) * np.isin(np.arange(len(x)), own)
     here = np.asarray(problem.compiled.linearised(x, directions)[1])
     middle = np.concatenate(
-        [none, *(np.full(b.index.size, problem.usual[b.name][0]) for b in real if b.local)]
+        [none, *(np.full(b.index.size, problem.prior_spread.usual(b.index)[0]) for b in real if b.local)]
     )
     found = []
     for position in shared:

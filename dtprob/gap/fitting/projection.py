@@ -203,7 +203,7 @@ def _centred_on_states(
     """
     beside = active.local_index.size <= _MOST_BESIDE
     there, at = x.copy(), active.global_index[inner]
-    there[at] = problem.prior_middle[0][at]
+    there[at] = problem.prior_spread.middle[at]
     if beside:
         there[active.local_index] -= own.deviation
     moved = np.asarray(problem.compiled.linearised(there, directions)[1])

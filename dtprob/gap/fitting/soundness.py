@@ -160,13 +160,15 @@ def _contradicted(problem: Problem, fitted: Fit) -> list[str]:
         return []
     active = activate(problem, fitted.effects)
     asked, index = ~are_states(problem, active), active.global_index
-    (middle, deviation), (least, largest) = problem.prior_middle, problem.prior_ends
-    away = np.abs(fitted.x - middle) / np.maximum(deviation, 1e-300)
-    beyond = (away > _CONTRADICTED) & (fitted.x > largest)
+    spread = problem.prior_spread
+    away = np.abs(fitted.x - spread.middle) / np.maximum(spread.deviation, 1e-300)
+    beyond = (away > _CONTRADICTED) & (fitted.x > spread.largest)
     for block in (b for b in active.blocks if not b.local and b.owner is None):
         kind = base_constraint(problem.declaration.sites[block.name].support)
         if kind is constraints.real:
-            beyond[block.index] |= (away > _CONTRADICTED)[block.index] & (fitted.x < least)[block.index]
+            beyond[block.index] |= (away > _CONTRADICTED)[block.index] & (fitted.x < spread.least)[
+                block.index
+            ]
         elif not isinstance(kind, type(constraints.positive)):
             beyond[block.index] = False
     told = [(owner, i) for owner, i, is_asked in zip(_names(active), index, asked, strict=True) if is_asked]

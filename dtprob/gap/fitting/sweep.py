@@ -94,7 +94,7 @@ def _moved(
 ) -> tuple[np.ndarray, np.ndarray]:
     """The point with a coordinate of all clusters moved, in standard deviations of its prior, and the terms there."""
     moved = x.copy()
-    moved[one.positions] += by * problem.usual[one.name][1]
+    moved[one.positions] += by * problem.prior_spread.usual(problem.layout[one.name].index)[1]
     return moved, np.nan_to_num(terms(moved), nan=-np.inf)
 
 
@@ -182,7 +182,7 @@ def _locals(problem: Problem) -> list[_Local]:
 
 def _places(problem: Problem, name: str) -> np.ndarray:
     """Where a coordinate may be, by its prior."""
-    centre, scale = problem.usual[name]
+    centre, scale = problem.prior_spread.usual(problem.layout[name].index)
     return centre + scale * np.linspace(-_REACH, _REACH, _PLACES)
 
 

@@ -39,9 +39,9 @@ def check_nulls(problem: Problem) -> None:
     own = [e for e in problem.effects if not _is_of_library(e)]
     if not own:
         return
-    centre, spread = problem.prior_middle
-    values = dict(problem.compiled.sites(centre + spread))
-    observed = problem.compiled.observations(centre + spread)
+    there = problem.prior_spread.middle + problem.prior_spread.deviation
+    values = dict(problem.compiled.sites(there))
+    observed = problem.compiled.observations(there)
     context = Context(problem.data, values)
     for effect in own:
         given = effect.null()

@@ -15,7 +15,6 @@ from typing import Any, final
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy import special
 
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.library import check_sites
@@ -31,6 +30,7 @@ from dtprob.gap.model.layout import Block, Known, Layout, make_layout, normal_of
 from dtprob.gap.model.observed import Observed
 from dtprob.gap.model.own import Own
 from dtprob.gap.model.prior import Prior
+from dtprob.gap.model.prior_spread import DRAWS, PriorSpread
 from dtprob.gap.model.programs import Programs
 from dtprob.gap.model.rows import Rows, make_rows
 from dtprob.gap.model.running import Arrays, Runner
@@ -42,11 +42,6 @@ from dtprob.inference.posterior import Sampler
 from dtprob.models.arguments import Data, Model, as_arrays, split_static, within
 from dtprob.models.declaration import Declaration, declare
 from dtprob.models.supported import check_supported
-
-_REFERENCE_DRAWS = 1000
-_TENTH = 1.2815515655446004
-"""Standard deviations from a normal distribution's middle to its last tenth."""
-_SCORES = sorted([*np.linspace(-3.0, 3.0, 25).tolist(), -_TENTH, _TENTH])
 
 
 @final
@@ -102,13 +97,12 @@ class Problem:
         self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
             shared = [b.name for b in self.blocks_of(None) if not b.local]
-            draws = self._prior.reference_draws(reference, shared, _REFERENCE_DRAWS, self.arrays)
+            draws = self._prior.reference_draws(reference, shared, DRAWS, self.arrays)
             self.known = normal_of(draws)
             self._lay_out()
 
     def _declare(self, model: Model, static: Any) -> None:
-        for name in ("_prior_quantiles", "prior_middle", "usual"):  # of sites that may have another name now
-            self.__dict__.pop(name, None)
+        self.__dict__.pop("prior_spread", None)  # of sites that may have another name now
         self.model = model
         self.declaration: Declaration = declare(model, self.data, cluster=self._cluster)
         self._declared = Declared(model, self.declaration, static)
@@ -338,32 +332,9 @@ class Problem:
         return np.where(np.isfinite(x), x, 0.0)
 
     @cached_property
-    def _prior_quantiles(self) -> np.ndarray:
-        """Of prior draws of each coordinate (score, dimension): the least, those at `_SCORES`, and the largest."""
-        draws = self.prior_draws(jax.random.key(0), _REFERENCE_DRAWS)
-        return np.quantile(draws, [0.0, *special.ndtr(_SCORES), 1.0], axis=0)
-
-    @cached_property
-    def prior_middle(self) -> tuple[np.ndarray, np.ndarray]:
-        """Median and standard deviation, by the middle eight tenths of the prior, of each coordinate (dimension,)."""
-        low, middle, high = (self._prior_quantiles[1 + _SCORES.index(s)] for s in (-_TENTH, 0.0, _TENTH))
-        return middle, (high - low) / (2 * _TENTH)
-
-    @property
-    def prior_ends(self) -> tuple[np.ndarray, np.ndarray]:
-        """The least and the largest of a thousand prior draws of each coordinate (dimension,)."""
-        return self._prior_quantiles[0], self._prior_quantiles[-1]
-
-    def prior_score(self, x: np.ndarray, index: np.ndarray) -> np.ndarray:
-        """Normal scores among prior draws, at most 3 from 0, of some coordinates of a point, all of the base model."""
-        return np.array([np.interp(x[i], self._prior_quantiles[1:-1, i], _SCORES) for i in index])
-
-    @cached_property
-    def usual(self) -> dict[str, tuple[float, float]]:
-        """Centre and standard deviation, by the middle eight tenths of the prior, of the base model's latent sites."""
-        middle, deviation = self.prior_middle
-        blocks = [(b.name, b.index) for b in self.blocks_of(None) if b.size]
-        return {name: (float(np.median(middle[i])), float(np.median(deviation[i]))) for name, i in blocks}
+    def prior_spread(self) -> PriorSpread:
+        """Where the prior puts the base model's unknowns."""
+        return PriorSpread.of_draws(self.prior_draws(jax.random.key(0), DRAWS))
 
     def initial(self, x: np.ndarray, effects: Sequence[Effect]) -> dict[str, jax.Array]:
         """Constrained values at x of the latent sites and of the given live mean effects' parameters, by site name."""

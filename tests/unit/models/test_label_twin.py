@@ -180,9 +180,9 @@ def test_maps_of_whole_decibels_are_numbers_like_others():
         Problem(label_twin, data | {"prediction": jnp.asarray(kind)}, [])
         for kind in (prediction, prediction.astype(float))
     )
-    x = whole.prior_middle[0]
+    x = whole.prior_spread.middle
     shift = {"predicted_label": jnp.full((1, 30), 0.3)}
-    np.testing.assert_allclose(x, real.prior_middle[0])
+    np.testing.assert_allclose(x, real.prior_spread.middle)
     np.testing.assert_array_equal(*(np.asarray(one.compiled.shifted(x, shift, 1)) for one in (whole, real)))
 
 

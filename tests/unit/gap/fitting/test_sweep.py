@@ -66,7 +66,7 @@ def places(problem, x):
 
 
 def test_usual_places_are_those_of_the_prior(problem):
-    centre, scale = problem.usual["late"]
+    centre, scale = problem.prior_spread.usual(problem.layout["late"].index)
     assert np.isclose(centre, 0.0, atol=0.1)
     assert np.isclose(scale, 1.0, atol=0.15)
 

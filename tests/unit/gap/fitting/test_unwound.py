@@ -60,7 +60,7 @@ def test_a_walk_of_more_than_a_turn_is_followed():
     phase, data = walks()
     assert np.abs(phase[-1] - data["first"]).max() > 1.5 * np.pi
     problem = Problem(tracked, data, [])
-    middle = problem.prior_middle[0]
+    middle = problem.prior_spread.middle
     found = [problem.compiled.sites(x)["phase"] for x in unwound(problem, middle)]
     assert len(found) == 2
     for one in found:
@@ -87,7 +87,7 @@ def test_what_all_windows_share_is_followed_too(rate):
         "seen": wrapped(phase + rng.normal(0, NOISE, 60)),
     }
     problem = Problem(drifting, data, [], "window")
-    found = [problem.compiled.sites(x)["phase"] for x in unwound(problem, problem.prior_middle[0])]
+    found = [problem.compiled.sites(x)["phase"] for x in unwound(problem, problem.prior_spread.middle)]
     assert min(np.abs(one - phase).max() for one in found) < 1.0
 
 
@@ -98,4 +98,4 @@ def test_readings_that_do_not_go_on_and_those_of_one_turn_are_left_alone():
     near = {**data, "seen": wrapped(data["first"] + rng.normal(0, NOISE, data["seen"].shape))}
     for given in (anywhere, near):
         problem = Problem(tracked, given, [])
-        assert unwound(problem, problem.prior_middle[0]) == []
+        assert unwound(problem, problem.prior_spread.middle) == []

@@ -33,7 +33,7 @@ def line(x, y=None):
 def kinds(model, **data):
     data = {name: jnp.asarray(value) for name, value in data.items()}
     problem = Problem(model, data, [])
-    sites = problem.compiled.sites(problem.prior_middle[0])
+    sites = problem.compiled.sites(problem.prior_spread.middle)
     return {n: sites[n].dtype.kind for n in problem.declaration.deterministic}
 
 
