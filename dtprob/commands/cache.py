@@ -41,10 +41,17 @@ def prune(folder: Path, largest: int) -> None:
     files = sorted(_files(folder), key=lambda found: max(found[0].st_mtime, found[0].st_atime))
     total = sum(stat.st_size for stat, _ in files)
     for stat, path in files:
-        if total <= largest:
-            return
-        Path(path).unlink(missing_ok=True)
-        total -= stat.st_size
+        if total > largest:
+            Path(path).unlink(missing_ok=True)
+            total -= stat.st_size
+        elif stat.st_atime > stat.st_ctime:
+            _let_note_its_use(stat, path)
+
+
+def _let_note_its_use(stat: os.stat_result, path: str) -> None:
+    """Have the next reading of a file noted: systems note the first after a change, and of the others one a day."""
+    with suppress(OSError):
+        os.utime(path, ns=(stat.st_atime_ns, stat.st_mtime_ns))
 
 
 def _files(folder: Path) -> Iterator[tuple[os.stat_result, str]]:

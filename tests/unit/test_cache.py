@@ -1,6 +1,7 @@
 """Compiled programs are kept where the user's cache lies, and the oldest go when there are too many."""
 
 import os
+import time
 from types import SimpleNamespace
 
 import pytest
@@ -24,6 +25,20 @@ def test_an_old_program_that_is_still_used_stays(tmp_path):
         os.utime(tmp_path / name, (1e9 + 9 if name == "used" else 1e9 - age, 1e9 - age))
     cache.prune(tmp_path, 250)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["new", "used"]
+
+
+def test_the_next_use_of_a_program_is_noted(tmp_path):
+    """Systems note when a file was read only where it has changed since the last reading, or that was the day before."""
+    file = tmp_path / "used"
+    file.write_bytes(bytes(100))
+    read = file.stat().st_ctime_ns + 10**8
+    os.utime(file, ns=(read, 10**18))
+    time.sleep(0.2)
+    assert file.stat().st_ctime_ns < read
+    cache.prune(tmp_path, 250)
+    found = file.stat()
+    assert (found.st_atime_ns, found.st_mtime_ns) == (read, 10**18)
+    assert found.st_ctime_ns > read
 
 
 def test_a_folder_that_is_not_there_yet_is_no_error(tmp_path):
