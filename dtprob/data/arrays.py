@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -102,10 +102,43 @@ def _check(name: str, array: np.ndarray, spec: ArraySpec, sizes: dict[str, int])
 def _convert(name: str, array: np.ndarray, kind: NumberKind) -> np.ndarray:
     if array.dtype.kind == "f" and kind == "integer" and _is_whole(array):
         array = array.astype(np.int64)
-    if array.dtype.kind not in _ACCEPTED[kind]:
-        got = f"values of type {array.dtype}"
-        raise InputError(name, f"{kind} numbers", got, f"Store {name} as {kind} numbers")
+    check_kind(name, array, kind)
     return array.astype(_DTYPE[kind])
+
+
+def check_kind(name: str, array: np.ndarray, kind: NumberKind) -> None:
+    """Raise an InputError that names the array and the first value that is no number of this kind, with its index."""
+    if array.dtype.kind not in _ACCEPTED[kind]:
+        raise InputError(name, f"{kind} numbers", _odd(array), f"Store {name} as {kind} numbers")
+
+
+def _odd(array: np.ndarray) -> str:
+    """The first value that is no number, or no whole one, or what all are."""
+    if array.dtype.kind == "U":
+        odd = np.reshape([bool(w) and not is_number(w) for w in array.flat], array.shape).astype(bool)
+        others = "numbers as text" if array.size else "an empty array"
+    elif array.dtype.kind == "f":
+        odd, others = array != np.round(array), "numbers too large to be counted"
+    else:
+        odd, others = np.zeros(array.shape, bool), f"values of type {array.dtype}"
+    if not odd.any():
+        return others
+    index = tuple(int(i) for i in np.argwhere(odd)[0])
+    value = array[index].item()
+    return f"{'NaN' if array.dtype.kind == 'f' and np.isnan(value) else repr(value)}{_at(index)}"
+
+
+def is_number(value: Any) -> bool:
+    """Whether a value, or what a word says, is a number."""
+    try:
+        float(value)
+    except (TypeError, ValueError):
+        return False
+    return True
+
+
+def _at(index: tuple[int, ...]) -> str:
+    return f" at index {index if len(index) != 1 else index[0]}" if index else ""
 
 
 def _is_whole(array: np.ndarray) -> bool:
@@ -149,8 +182,9 @@ def check_finite(name: str, array: np.ndarray, *, allow_nan: bool = False) -> No
     if bad.any():
         index = tuple(int(i) for i in np.argwhere(bad)[0])
         got = "NaN" if np.isnan(array[index]) else "infinity"
-        place = f" at index {index if len(index) != 1 else index[0]}" if index else ""
-        raise InputError(name, "finite numbers", f"{got}{place}", "Remove or repair what was not measured")
+        raise InputError(
+            name, "finite numbers", f"{got}{_at(index)}", "Remove or repair what was not measured"
+        )
 
 
 def _check_range(name: str, array: np.ndarray, spec: ArraySpec) -> None:

@@ -155,7 +155,9 @@ def _read_csv(path: Path) -> Arrays:
     try:
         second = pd.read_csv(path, header=None, skiprows=1, nrows=1).iloc[0].tolist()
     except pd.errors.EmptyDataError:
-        second = []
+        raise InputError(
+            str(path), "a row for each reading", "a header alone", "Write what was measured"
+        ) from None
     if not all(pd.isna(cell) for cell in second[len(header) :]):
         got, remedy = f"{len(second)} cells in the first row, {len(header)} names", "Name every column"
         raise InputError(str(path), "a name for each column", got, remedy)

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from dtprob.data import network, uwb_apartment
-from dtprob.data.arrays import ArraySpec, side_by_side
+from dtprob.data.arrays import ArraySpec, check_kind, side_by_side
 from dtprob.data.formats import Arrays, load_arrays
 from dtprob.data.kinds import (
     CHANNEL_ARRAYS,
@@ -110,6 +110,12 @@ def _channels(arrays: Arrays, *, matlab: bool) -> ChannelData:
     if "channel" not in arrays:
         shape = "(link, snapshot, rx_antenna, tx_antenna, subcarrier)"
         raise InputError("channel", f"an array of shape {shape}", "nothing", "Add this array to the data")
+    check_kind("channel", arrays["channel"], "complex")
+    if arrays["channel"].dtype.kind != "c":
+        remedy = "Store amplitude and phase, or received powers as 'power' for a model of powers"
+        raise InputError("channel", "complex coefficients", "real numbers", remedy)
+    if arrays["channel"].size and not arrays["channel"].any():
+        raise InputError("channel", "measured coefficients", "zeros alone", "Store what was measured")
     return ChannelData(**_canonical(arrays, CHANNEL_ARRAYS, matlab=matlab))
 
 
@@ -125,8 +131,8 @@ def _powers(arrays: Arrays, *, matlab: bool) -> PowerData:
     if decibels is not None and reference is not None:
         if "power" in arrays:
             raise InputError("power_db", "either power or power_db", "both", "Leave one of them out")
-        _numeric("power_db", decibels)
-        _numeric("power_reference", reference)
+        check_kind("power_db", decibels, "real")
+        check_kind("power_reference", reference, "real")
         if reference.size != 1:
             raise InputError(
                 "power_reference", "one number", f"shape {reference.shape}", "Give the power of 0 dB"
@@ -137,13 +143,6 @@ def _powers(arrays: Arrays, *, matlab: bool) -> PowerData:
         if name not in POWER_ARRAYS:
             raise unknown_name("array", name, valid, "array name")
     return PowerData(**_canonical(arrays, POWER_ARRAYS, matlab=matlab))
-
-
-def _numeric(name: str, array: np.ndarray) -> None:
-    if array.dtype.kind not in "fiu":
-        raise InputError(
-            name, "real numbers", f"values of type {array.dtype}", f"Store {name} as real numbers"
-        )
 
 
 def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
@@ -165,7 +164,7 @@ def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
     arrays = _canonical(arrays, LABEL_ARRAYS, matlab=matlab)
     if arrays["x"].ndim == 1:
         arrays["x"] = arrays["x"][:, None]
-    _numeric("y", arrays["y"])
+    check_kind("y", arrays["y"], "real")
     y = np.asarray(arrays["y"], dtype=float)
     labelled = ~np.isnan(y)
     others = {name: arrays.get(name) for name in optional}

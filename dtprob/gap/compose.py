@@ -17,6 +17,7 @@ from dtprob.gap.located import along, unlisted, where
 from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.closed_share import closed_shares
+from dtprob.gap.where.kinds import whereabouts
 from dtprob.gap.where.site_finding import SiteFinding
 from dtprob.gap.which.screen import Screening
 from dtprob.gap.which.trials import credit
@@ -136,11 +137,11 @@ def _undecided(sets: Sequence[Sequence[str]]) -> str:
 
 
 def _place(found: SiteFinding) -> str:
-    """A site, or a moment of an observation, as text."""
-    if found.moment is None:
-        return found.site
-    what, _, whither = found.moment.partition(" ")
-    return f"the {what} of {found.site} {whither}".rstrip()
+    """A site, or a moment of an observation, as text, and where there."""
+    what, _, whither = (found.moment or "").partition(" ")
+    there = whereabouts(found.family)
+    site = f"the {what} of {found.site} {whither}".rstrip() if what else found.site
+    return f"{site} ({there})" if there else site
 
 
 def _tried(evidence: Evidence) -> list[dict[str, Any]]:

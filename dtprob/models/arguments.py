@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from dtprob.data.arrays import is_number
 from dtprob.errors import InputError, nearest
 
 type Data = Mapping[str, Any]
@@ -97,15 +98,6 @@ def _column(name: str, entry: Any) -> Any:
     words = "Give each word a whole number (the first of pandas.factorize), each time seconds, or leave the column out."
     repair = "Write it as a number, or mask the reading."
     raise InputError(f"data {name!r}", "numbers", got, words if 2 * len(odd) > array.size else repair)
-
-
-def is_number(value: Any) -> bool:
-    """Whether a value, or what a word says, is a number."""
-    try:
-        float(value)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def select_arguments(function: Model, data: Data) -> dict[str, Any]:

@@ -98,6 +98,14 @@ def place_words(site: Site) -> str:
     return f" (most of it at {site['place'].replace('_', ' ')})" if "place" in site else ""
 
 
+def whereabouts(site: Site) -> str:
+    """The same, and along what or where a site is wrong: ` (along day by access point, most of it at access point 11)`."""
+    there, place = kinds.whereabouts(site.get("family", "")), place_words(site)
+    if there is None:
+        return place
+    return f" ({words(there)}, {place.removeprefix(' (')}" if place else f" ({words(there)})"
+
+
 def moment(site: Site) -> str | None:
     """What of an observation is wrong where its values are right, as its family tells it."""
     return kinds.moment(site.get("family", ""))

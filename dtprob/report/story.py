@@ -14,7 +14,6 @@ from dtprob.report.names import (
     listing,
     located_words,
     moment,
-    place_words,
     shares,
     significant,
     size_reading,
@@ -22,6 +21,7 @@ from dtprob.report.names import (
     term,
     together,
     user_terms,
+    whereabouts,
     words,
 )
 from dtprob.report.next_step import changed, decides, left_over, next_step, rivals
@@ -279,9 +279,9 @@ def advice(effect: str) -> str:
 
 
 def _seat(report: Report) -> str:
-    """` and lies in the path delays (most of it at link 3)`, where the remainder or the gap was located."""
+    """` and lies in the path delays (along time, most of it at link 3)`, where the remainder or the gap was located."""
     left = left_over(report) or significant(report["where"]["sites"])[:1]
-    return f" and lies in the {listing(map(located_words, left[:2]))}{place_words(left[0])}" if left else ""
+    return f" and lies in the {listing(map(located_words, left[:2]))}{whereabouts(left[0])}" if left else ""
 
 
 _COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}

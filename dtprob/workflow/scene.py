@@ -81,8 +81,12 @@ def paths_of(
         raise InputError(case.path.name, f"a section [scene] for {case.model.name}", "none", remedy)
     if scene.file.lower().endswith(".nc"):
         _check_needs_no_trace(scene, case)
-        return _same_links(storage.load(scene.file), _placed(scene, data), case)
+        paths = _same_links(storage.load(scene.file), _placed(scene, data), case)
+        _check_tones(paths.frequency, data)
+        return paths
     kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
+    if scene.frequency is not None:
+        _check_tones(scene.frequency, data)
     if kept is not None and kept.is_file():
         say(f"taking the paths that were traced before, {kept.name}")
         return storage.load(kept)
@@ -231,6 +235,15 @@ def _named(file: Path) -> set[str]:
         return set()  # the ray tracer says what is wrong
     values = [e.get("value") for e in elements if e.get("name") == "filename"]
     return {name for name in (*values, *(e.get("filename") for e in elements)) if name}
+
+
+def _check_tones(carrier: float, data: ChannelData | PowerData) -> None:
+    """Refuse frequencies that count from zero where they are to count from the carrier."""
+    if isinstance(data, ChannelData) and data.subcarrier_frequency.min() > carrier / 2:
+        got = f"{data.subcarrier_frequency.min():g} Hz and more"
+        raise InputError(
+            "subcarrier_frequency", f"Hz from the carrier, {carrier:g} Hz", got, "Subtract the carrier"
+        )
 
 
 def _same_links(paths: PathSet, data: ChannelData | PowerData, case: Case) -> PathSet:

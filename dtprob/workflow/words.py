@@ -8,8 +8,8 @@ from typing import Any, Final
 import numpy as np
 
 from dtprob.case import Words
+from dtprob.data.arrays import is_number
 from dtprob.errors import InputError, nearest, unknown_name
-from dtprob.models.arguments import is_number
 
 _MOST: Final = 24
 """Different words up to which a column is told as a list that the CASE could have."""

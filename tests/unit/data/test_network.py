@@ -78,7 +78,7 @@ def test_a_buffer_that_cannot_follow_is_named(tmp_path, columns):
     ("change", "message"),
     [
         (lambda c: c.assign(buffer_9=0), "buffer_4: expected a column, got nothing"),
-        (lambda c: c.iloc[:0], "expected at least one row, got an empty table"),
+        (lambda c: c.iloc[:0], "expected a row for each reading, got a header alone"),
         (lambda c: changed(c, 3, action_0=2), r"action_0: expected 0 or 1, got 2 in row 4 "),
     ],
 )

@@ -325,13 +325,22 @@ BAD_CHANNELS = {
     "no channel": (lambda a: {"channel": None}, "channel: expected an array of shape .* got nothing"),
     "text": (
         lambda a: {"snapshot_time": np.array(["a"] * 4)},
-        "snapshot_time: expected real numbers, got values",
+        "snapshot_time: expected real numbers, got 'a' at index 0",
     ),
     "complex positions": (
         lambda a: {"tx_position": a["tx_position"] * 1j},
         "tx_position: expected real numbers",
     ),
     "empty": (lambda a: {"channel": a["channel"][:0]}, "channel: expected at least one link"),
+    "amplitudes": (
+        lambda a: {"channel": np.abs(a["channel"])},
+        r"channel: expected complex coefficients, got real numbers\. Store amplitude and phase",
+    ),
+    "nothing measured": (lambda a: {"channel": 0 * a["channel"]}, "channel: .* got zeros alone"),
+    "words": (
+        lambda a: {"channel": np.full(a["channel"].shape, "a")},
+        r"channel: expected complex numbers, got 'a' at index \(0, 0, 0, 0, 0\)",
+    ),
     "one frequency": (
         lambda a: {"subcarrier_frequency": 0 * a["subcarrier_frequency"] + 5.0},
         r"subcarrier_frequency: expected different frequencies, got 5 Hz for all",
@@ -362,7 +371,15 @@ BAD_COLUMNS = {
         lambda c: {"slot": np.where(c["slot"] == 4, np.inf, c["slot"])},
         "slot: expected integer numbers",
     ),
-    "fraction": (lambda c: {"buffer_0": c["slot"] / 3}, "buffer: expected integer numbers"),
+    "fraction": (lambda c: {"buffer_0": c["slot"] / 2}, r"buffer: .*, got 0\.5 at index \(1, 0\)"),
+    "empty cell": (
+        lambda c: {"buffer_1": np.where(np.arange(len(c["slot"])) == 2, np.nan, c["buffer_1"])},
+        r"buffer: expected integer numbers, got NaN at index \(2, 1\)",
+    ),
+    "word": (
+        lambda c: {"action_0": np.where(np.arange(len(c["slot"])) == 1, "no", c["action_0"].astype(str))},
+        r"action: expected integer numbers, got 'no' at index \(1, 0\)",
+    ),
 }
 
 
@@ -388,6 +405,18 @@ def test_bad_powers_and_labels_are_named(tmp_path):
         read(save(tmp_path / "b.npz", {"x": np.zeros(2), "y": np.full(2, np.nan)}))
     with pytest.raises(InputError, match="x: expected finite numbers, got NaN"):
         read(save(tmp_path / "c.npz", {"x": np.array([0, np.nan]), "y": np.zeros(2)}))
+
+
+def test_the_first_word_among_labels_is_named(tmp_path):
+    (tmp_path / "a.csv").write_text("x_0,x_1,y\n0,1,\n0,low,1\n")
+    with pytest.raises(InputError, match=r"x: expected real numbers, got 'low' at index \(1, 1\)"):
+        read(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("x_0,y\n0,\n1,2;5\n")
+    with pytest.raises(InputError, match="y: expected real numbers, got '2;5' at index 1"):
+        read(tmp_path / "a.csv")
+    (tmp_path / "a.csv").write_text("x_0,y\n")
+    with pytest.raises(InputError, match="expected a row for each reading, got a header alone"):
+        read(tmp_path / "a.csv")
 
 
 def test_features_of_other_lengths_are_named(tmp_path):

@@ -217,6 +217,30 @@ def test_the_place_that_stands_out_is_told_in_words() -> None:
     assert names.place_words({**site, "place": "access_point 11"}) == " (most of it at access point 11)"
 
 
+@pytest.mark.parametrize(
+    ("family", "told"),
+    [
+        ("additive, slot 408 to 435", " (slot 408 to 435)"),
+        ("spread, device 17, reading 438 to 468", " (device 17, reading 438 to 468)"),
+        ("relative, along day by access_point", " (along day by access point)"),
+        ("additive, over snr and load", " (over snr and load)"),
+        ("additive, every 4 along episode and slot", " (every 4 along episode and slot)"),
+        ("additive, ripple in day, 9 to 16 half waves", ""),
+        ("dependence on those 2 before along report, each", ""),
+        ("additive, by access_point", ""),
+        ("additive", ""),
+    ],
+)
+def test_it_is_told_where_or_along_what_a_site_is_wrong(family: str, told: str) -> None:
+    """Which slots, devices and columns they are is what helps; a number of half waves does not."""
+    site = {"site": "mean", "p_value": 1e-9, "share": 0.9, "family": family}
+    assert names.whereabouts(site) == told
+    most = " (most of it at row 9)" if not told else f"{told[:-1]}, most of it at row 9)"
+    assert names.whereabouts({**site, "place": "row 9"}) == most
+    report = {**_unlisted(), "unlisted": {"p_value": 1e-9, "sites": ["mean"], "located": [site]}}
+    assert f"lies in the {names.located_words(site)}{told}" in tell(report).meaning
+
+
 def test_values_that_are_read_too_often_call_for_what_makes_them() -> None:
     site = {
         "site": "y",

@@ -223,6 +223,18 @@ def test_paths_of_other_positions_are_refused(folder):
         prepare(load_case(folder / "case.toml"), need="fit")
 
 
+def test_frequencies_that_count_from_zero_are_refused(folder):
+    arrays = dict(np.load(folder / "channels.npz"))
+    carrier = storage.load(folder / "paths.nc").frequency
+    np.savez(
+        folder / "channels.npz", **arrays | {"subcarrier_frequency": arrays["subcarrier_frequency"] + carrier}
+    )
+    with pytest.raises(
+        InputError, match=r"subcarrier_frequency: expected Hz from the carrier, .*Subtract the carrier"
+    ):
+        prepare(load_case(folder / "case.toml"), need="fit")
+
+
 def test_links_that_no_path_reaches(folder):
     """They are named, and left out only if the case asks for it."""
     paths = storage.load(DEMO / "paths.nc").take(np.arange(5))
