@@ -186,8 +186,8 @@ def _named(suspects: Sequence[Suspect]) -> dict[str, Suspect]:
 def _wider(view: View, named: Mapping[str, Suspect]) -> tuple[Problem, fitting.Fit]:
     """The problem with families as fields, and the view's fit in its coordinates."""
     problem, fitted = view.problem, view.fitted
-    at = problem.compiled.sites(fitted.x)
-    positive = {s.site for s in named.values() if s.rows is None and _is_positive(at[s.site])}
+    sites = {s.site for s in named.values() if s.rows is None}
+    positive = {site for site in sites if _has_to_be_positive(problem, fitted.x, site)}
     fields = [field_of(problem, n, s, positive=s.site in positive) for n, s in named.items()]
     own = [n for n, s in named.items() if is_by_cluster(problem, s)]
     wider = problem.with_fields(fields, own)
@@ -236,5 +236,10 @@ def _term(problem: Problem, suspect: Suspect) -> Term:
     )
 
 
-def _is_positive(value: jax.Array) -> bool:
-    return not jnp.iscomplexobj(value) and bool(jnp.all(value > 0))
+def _has_to_be_positive(problem: Problem, x: np.ndarray, site: str) -> bool:
+    """Whether a site's values are positive and no density comes of negative ones, as of a scale or a rate."""
+    like, found = problem.float_sites[site], problem.compiled.sites(x)[site]
+    if jnp.issubdtype(like.dtype, jnp.complexfloating) or not bool(jnp.all(found > 0)):
+        return False
+    value = np.broadcast_to(np.asarray(found), like.shape)
+    return not np.isfinite(problem.compiled.shifted(x, {site: -2 * value[None]}, 1)).all()

@@ -14,6 +14,8 @@ SURE: Final = 0.005
 """Probability below which a site is surely wrong."""
 _END: Final = math.exp(LOG_SMALLEST + 14)
 """Probability near which p-values, adjusted for many tests, end."""
+_FAR_READINGS: Final = 1e-9
+"""Probability of the tails from which far readings are what is wrong, and ripples of a spread follow them."""
 _LIKE_NOISE: Final = 20.0
 """Times the residuals' energy up to which a squared score over its variance is as noise makes it, in the best of many."""
 
@@ -85,6 +87,8 @@ def likely_left(found: Iterable[SiteFinding]) -> float:
 def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFinding]:
     """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong.
 
+    Ripples of a spread come last where tails are what is wrong: the finest ones find any reading that is far off.
+
     A site that says how observations spread is one of their moments, by whatever name. Where p-values end values come last
     if their scores are no larger than noise of such an energy (of the residuals, over its expectation) makes them.
     """
@@ -93,8 +97,13 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
     of_moments = min((f.p_value for f, one in zip(findings, values, strict=True) if not one), default=1.0)
     score = max((f.score for f, one in zip(findings, values, strict=True) if one), default=0.0)
     by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
+    strays = any(f.moment == "tails" and f.p_value <= _FAR_READINGS for f in findings)
     return [
-        replace(f, last=of_values <= SURE and is_value == by_noise and not f.repeats)
+        replace(
+            f,
+            last=(of_values <= SURE and is_value == by_noise and not f.repeats)
+            or (strays and not is_value and "ripple" in f.family),
+        )
         for f, is_value in zip(findings, values, strict=True)
     ]
 

@@ -20,6 +20,8 @@ _BETTER: Final = 3.0
 _FAR: Final = 8.0
 _FAR_SHARE: Final = 0.15
 """Nats, and share of what was gained, by which it has to be better than a single effect, real ones having other forms."""
+_HALF: Final = 0.5
+"""Share of a small gain that suffices: what leaves so much is the smaller part."""
 _ALIKE: Final = 0.5
 """Parameters by which it is simpler than they are."""
 _KEPT: Final = 0.5
@@ -45,7 +47,7 @@ def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> 
         return False
     worth = credit(bare.problem, found, base)
     may_imitate = len(found.effects) > 1 or found.effects == (field,)
-    least = worth + (_BETTER if may_imitate else max(_FAR, _FAR_SHARE * (worth - base.log_evidence)))
+    least = worth + (_BETTER if may_imitate else _lead(worth - base.log_evidence))
     verb = "stands" if len(found.effects) == 1 else "stand"
     doing = f"looking whether {' and '.join(found.effects)} {verb} in for what varies more simply at a site"
     effects = (effect for effect in end.problem.effects if effect.name in found.effects)
@@ -60,6 +62,11 @@ def stands_in(bare: View, end: View, base: Fit, field: str | None, say: Say) -> 
             if beside(end, one) - most < enough:
                 return True
     return False
+
+
+def _lead(gain: float) -> float:
+    """Nats by which a family has to be better than a single effect that has gained so many."""
+    return max(_BETTER, min(max(_FAR, _FAR_SHARE * gain), _HALF * gain))
 
 
 def _freedom(end: View, effect: Effect) -> float:
