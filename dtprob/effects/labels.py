@@ -35,7 +35,7 @@ def regional_bias(sites: Sites, data: Data) -> list[Effect]:
             {"predicted_label": _added(region.weight)},
             (normal("bias", unit), *region.parameters),
             instance=region.name,
-            physics=f"Labels are higher than predicted {region.text}.",
+            physics=f"Labels are off {region.text}: higher than predicted by the bias, lower where it is negative.",
             source="y + b w(x), w of largest value 1.",
             requires=("x",),
         )

@@ -43,6 +43,8 @@ from dtprob.models.supported import differentiated_forwards
 _DEFAULT = Settings()
 _SOME = 0.2
 """Share of the gap that causes close at least, surely, where what is left is of another kind."""
+_IDLE = 0.5
+"""Share of what a cause had gained below which it does little beside a model of what it leaves."""
 
 
 def diagnose(
@@ -212,7 +214,7 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
     is_poor = cause.closed_fraction.mean < _relevance(evidence, settings)
     is_poor = is_poor and not (cause.closed_fraction.low >= _SOME and _leaves_moments(evidence, level))
     is_too_large = not cause.plausible and _are_fields(evidence)
-    if remains and (is_poor or is_too_large):
+    if remains and (is_poor or is_too_large or _hides(evidence, level)):
         return "UNLISTED"
     is_left = remains or bool(evidence.asked_for)
     leaves = is_left and (cause.closed_fraction.mean < 1 - settings.minor or _are_fields(evidence))
@@ -231,6 +233,18 @@ def _leaves_moments(evidence: Evidence, level: float) -> bool:
         and set(evidence.accepted) <= locating
         and all(s.spreads or s.moment is not None for s in left)
     )
+
+
+def _hides(evidence: Evidence, level: float) -> bool:
+    """Whether all that was named is how observations spread, which hides a wrong law of their values and is idle beside it.
+
+    Beside a twin that is far too sure of itself any noise closes nearly all of a gap.
+    """
+    rest, locating = evidence.remainder, evidence.steps[0].view.screening.scores.locating
+    values = [s for s in evidence.after.sites if s.p_value <= level and not s.spreads and s.moment is None]
+    if rest is None or not values or not locating.isdisjoint(evidence.accepted):
+        return False
+    return rest.beside < _IDLE * (evidence.fitted.log_evidence - evidence.base.log_evidence)
 
 
 def _relevance(evidence: Evidence, settings: Settings) -> float:

@@ -81,10 +81,11 @@ def bar(size: Interval) -> Bar | None:
     return Bar(place[0], place[1], place[2], place[3])
 
 
-def others(report: Report) -> list[tuple[Tried, float]]:
-    """The sets that were fitted beside the named one, each with the share of the named one's gain that it has.
+def others(report: Report) -> list[tuple[Tried, float, str]]:
+    """The sets that were fitted beside the named one, with their share of its gain and by how much they are less likely.
 
-    None where no cause is named; those that are just as possible are told as such.
+    None where no cause is named; those that are just as possible are told as such. What holds the named one and more is
+    no other explanation: what is more in it brings too little.
     """
     tried = report.get("tried", [])
     if report["verdict"] not in {"LISTED", "LISTED_WITH_REMAINDER"} or not tried:
@@ -93,7 +94,15 @@ def others(report: Report) -> list[tuple[Tried, float]]:
     possible = [named, *map(set, report["causes"][0]["alias_class"])]
     most = max(next((t["gain_nats"] for t in tried if set(t["effects"]) == named), 0.0), 1e-9)
     rest = [t for t in tried if set(t["effects"]) not in possible]
-    return [(t, min(max(t["gain_nats"] / most, 0.0), 1.0)) for t in rest]
+    more = "the rest brings too little"
+    return [
+        (
+            t,
+            min(max(t["gain_nats"] / most, 0.0), 1.0),
+            more if named < set(t["effects"]) else units.odds(t["behind_nats"]),
+        )
+        for t in rest
+    ]
 
 
 def ranked(candidates: Sequence[Candidate]) -> list[Candidate]:
@@ -125,7 +134,6 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     units.percent,
     units.chance,
     units.p_value,
-    units.odds,
     units.number,
     names.words,
     names.site_words,

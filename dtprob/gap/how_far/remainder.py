@@ -69,6 +69,7 @@ class Remainder:
         closed: share of what the causes leave that it closes; below zero if it makes predictions worse.
         held: held-out results with it.
         before, after: calibration of the predictions without and with it.
+        beside: log evidence that the causes bring beside it; infinite where there are none.
     """
 
     terms: tuple[Term, ...]
@@ -76,6 +77,7 @@ class Remainder:
     held: HeldOut
     before: Calibration
     after: Calibration
+    beside: float = np.inf
 
 
 def model_remainder(
@@ -113,7 +115,17 @@ def model_remainder(
         after,
         calibration(problem, folds),
         calibration(wider, parts),
+        full.log_evidence - _without(wider, full, fitted.effects) if fitted.effects else np.inf,
     )
+
+
+def _without(wider: Problem, full: fitting.Fit, causes: Sequence[str]) -> float:
+    """Log evidence of the model of the remainder alone."""
+    x, null, rest = full.x.copy(), wider.null(), tuple(n for n in full.effects if n not in causes)
+    for block in (b for b in wider.layout.blocks if b.owner in causes):
+        x[block.index] = null[block.index]
+    spread = {n: s for n, s in full.spread.items() if n in rest}
+    return fitting.fit(wider, x, rest, spread=spread, tolerance=_COARSE).log_evidence
 
 
 @dataclass(frozen=True)

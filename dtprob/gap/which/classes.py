@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Final
 
 import numpy as np
+
+IDLE: Final = float(np.log(3.0))
+"""Nats that an effect has to bring lest it is idle."""
 
 type Names = tuple[str, ...]
 
@@ -14,8 +18,8 @@ def credible(
 ) -> tuple[tuple[Names, ...], float]:
     """The sets that hold so much probability together, the likeliest first, and the probability of the accepted one.
 
-    A set that has a better one inside it is no other explanation: what it adds is not needed. Its probability counts for
-    the better one, whose effects are causes in both.
+    A set that has a better one inside it, or one that is hardly worse, is no other explanation: what it adds is not needed.
+    Its probability counts for that one, whose effects are causes in both.
 
     Args:
         worth: log evidence of each set, less what it has to be better by.
@@ -25,9 +29,9 @@ def credible(
     own = next(names for names in worth if set(names) == set(accepted))
     highest = max(worth.values())
     weight: dict[Names, float] = {}
-    for names in sorted(worth, key=lambda names: (-worth[names], names != own)):
-        better = (one for one in weight if set(one) < set(names) and names != own)
-        counted = next(better, names)
+    for names in sorted(worth, key=lambda names: (len(names), -worth[names])):
+        within = [one for one in weight if set(one) < set(names) and worth[names] < worth[one] + IDLE]
+        counted = names if names == own else max(within, key=worth.__getitem__, default=names)
         weight[counted] = weight.get(counted, 0.0) + float(np.exp(worth[names] - highest))
     total = sum(weight.values())
     likeliest = sorted(weight, key=lambda names: -weight[names])

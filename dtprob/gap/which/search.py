@@ -19,6 +19,7 @@ from dtprob.gap.fitting.refit import BETTER, without
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View, view
+from dtprob.gap.which.classes import IDLE
 from dtprob.gap.which.stand_in import stands_in
 from dtprob.gap.which.starts import beside, promising, refitted_with, refitted_without
 from dtprob.gap.which.trials import Say, Start, Trials, best, credit, remembered, tried
@@ -113,11 +114,25 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
                 both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=reached
             )
             ways.append([*steps[:-1], *others])
-    ways.sort(key=lambda way: -credit(problem, way[-1].view.fitted, base))
+    ways = _ranked(problem, ways, base)
     if stands_in(bare, ways[0][-1].view, base, field, say):
         ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
+
+
+def _ranked(problem: Problem, ways: Sequence[list[Step]], base: fitting.Fit) -> list[list[Step]]:
+    """The way whose end has most credit first, but one before it whose end lacks effects that bring hardly any."""
+    worth = [credit(problem, way[-1].view.fitted, base) for way in ways]
+    ordered = [ways[i] for i in sorted(range(len(ways)), key=lambda i: -worth[i])]
+    most = set(ordered[0][-1].view.fitted.effects)
+    plainer = (
+        way
+        for value, way in zip(sorted(worth, reverse=True), ordered, strict=True)
+        if set() < set(way[-1].view.fitted.effects) < most and value > max(worth) - IDLE
+    )
+    first = next(plainer, ordered[0])
+    return [first, *(way for way in ordered if way is not first)]
 
 
 def _reached(problem: Problem, ways: Sequence[Sequence[Step]], base: fitting.Fit) -> float:

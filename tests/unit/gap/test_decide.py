@@ -24,6 +24,7 @@ def evidence(kind, p_after, asked_for=(), left="additive, common", *, locates=Tr
         before=SimpleNamespace(site_p_value=1e-9),
         after=SimpleNamespace(site_p_value=p_after, sites=(SiteFinding("y", left, p_after, 9.0),)),
         asked_for=asked_for,
+        remainder=None,
     )
 
 
@@ -171,3 +172,20 @@ def test_several_effects_in_place_of_one_are_an_explanation():
     ).explanations
     assert set(found) == {("field",), ("three",), ("one", "two")}
     assert found["one", "two"].problem == "beside"
+
+
+@pytest.mark.parametrize(
+    ("left", "locates", "beside", "verdict"),
+    [
+        ("additive, along x by group", False, 40.0, "UNLISTED"),
+        ("additive, along x by group", False, 60.0, "LISTED"),
+        ("additive, along x by group", True, 40.0, "LISTED"),
+        ("spread, by group", False, 40.0, "LISTED"),
+    ],
+)
+def test_noise_that_hides_a_law_is_no_cause(left, locates, beside, verdict):
+    """Of 100 nats it keeps less than half beside a model of what it leaves, however much of the gap it closes."""
+    given = evidence("mean", 1e-9, left=left, locates=locates)
+    given.remainder = SimpleNamespace(beside=beside)
+    given.fitted, given.base = SimpleNamespace(log_evidence=-50.0), SimpleNamespace(log_evidence=-150.0)
+    assert decide(given, (cause(0.995),), Settings()) == verdict

@@ -80,3 +80,14 @@ def test_what_is_left_names_each_site_once_and_each_way_that_it_is_wrong():
     assert left["p_value"] == 1e-9
     assert left["sites"] == ["y"]
     assert [site["family"] for site in left["located"]] == ["dependence along link, common", "spread, common"]
+
+
+def test_it_is_said_where_a_site_is_wrong():
+    sites = (
+        SiteFinding("mean", "additive, slot 408 to 435", 1e-9, 9.0, place="slot 410"),
+        SiteFinding("y", "spread, ripple in day, 9 to 16 half waves", 1e-9, None),
+    )
+    evidence = SimpleNamespace(after=Location(sites, (), {}, 1e-9), problem=SimpleNamespace(effects=()))
+    assert summary("UNLISTED", (), evidence).endswith(
+        " It shows at mean (slot 408 to 435), the spread of y; most of it at slot 410."
+    )

@@ -16,7 +16,7 @@ from dtprob.effects.effect import FIELD
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.calibration import calibration
-from dtprob.gap.how_far.remainder import alone, model_remainder, shortlist
+from dtprob.gap.how_far.remainder import _has_to_be_positive, alone, model_remainder, shortlist
 from dtprob.gap.how_far.site_field import field_of
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.along import curves
@@ -370,3 +370,34 @@ def test_a_right_model_with_levels_of_its_own_is_calibrated(readings):
     found = calibration(problem, list(closed.fold_fits(problem, fitted, closed.folds(400, 2))))
     assert found.coverage == pytest.approx(0.9, abs=3.5 * np.sqrt(0.09 / 400))
     assert found.error_ratio == pytest.approx(1.0, abs=3.5 / np.sqrt(2 * 400))
+
+
+def of_rates(x, place=None, street=None, y=None):
+    del place, street
+    rate = numpyro.deterministic("rate", jnp.exp(numpyro.sample("b", dist.Normal(0.0, 1.0)) * x))
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Poisson(rate), obs=y)
+
+
+def of_levels(shift=0.0):
+    """A line over x from 40 up, whose levels happen to be positive."""
+    data = rows(1, shift)
+    up = 40.0 + np.abs(data["x"])
+    return {**data, "x": up, "y": data["y"] + 1.3 * (up - data["x"])}
+
+
+def test_only_what_cannot_be_negative_has_to_be_positive():
+    problem, fitted, *_ = prepared(of_levels())
+    assert not _has_to_be_positive(problem, fitted.x, "mean")
+    assert _has_to_be_positive(problem, fitted.x, "deviation")
+    counts = {**rows(1), "y": np.arange(N_ROW) % 7}
+    assert _has_to_be_positive(Problem(of_rates, counts, [], "street"), np.ones(1), "rate")
+
+
+def test_a_law_as_large_as_the_levels_that_it_is_added_to():
+    """Steps of 40 from levels about 52: as factors of these they would be anything."""
+    data = of_levels(lambda place, _: 40.0 - 80.0 * place)
+    held, found = modelled(data, ["along place"], spread=20.0)
+    assert found is not None
+    assert found.after.coverage == pytest.approx(0.9, abs=0.08)
+    assert found.held.log_likelihood.sum() > 0.02 * held.log_likelihood.sum()  # both are negative

@@ -82,3 +82,23 @@ def test_what_is_read_again_and_again_comes_first() -> None:
     spread, mean = SiteFinding("y", "spread, y", 1e-200, None), SiteFinding("mean", "additive, y", 1e-90, 5.0)
     assert min(shadows_last([mean, spread, alike], 4.0), key=rank) == alike
     assert not any(found.repeats for found in (spread, mean))
+
+
+@pytest.mark.parametrize(
+    ("family", "p_of_tails", "is_first"),
+    [
+        ("ripple in time, 33 to 64 half waves", 1e-30, False),
+        ("ripple in time, 33 to 64 half waves", 1e-6, True),
+        ("by group", 1e-30, True),
+    ],
+)
+def test_ripples_of_a_spread_follow_far_readings(family: str, p_of_tails: float, is_first: bool) -> None:
+    """The finest ripples are surely wrong wherever some readings are far off; a group that is louder is not."""
+    spread, tails = (
+        SiteFinding("y", f"spread, {family}", 1e-70, 0.0),
+        SiteFinding("y", "tails", p_of_tails, None),
+    )
+    deviation = SiteFinding("sd", f"additive, {family}", 1e-70, 0.0, spreads=True)
+    found = sorted(shadows_last([spread, deviation, tails], 1.0), key=rank)
+    assert (found[0].moment != "tails") == is_first
+    assert [f.last for f in found if f.moment != "tails"] == [not is_first] * 2

@@ -31,6 +31,14 @@ def test_a_set_that_is_better_than_what_is_inside_it_stays():
     assert probability == pytest.approx(0.8)
 
 
+def test_what_brings_hardly_more_is_no_other_explanation_either():
+    """An offset that noise swamps is as likely there as not, and says nothing against the noise."""
+    worth = {("noise",): 0.0, ("noise", "offset"): 0.1, ("offset",): -90.0}
+    assert credible(worth, ("noise",), 0.9) == ((("noise",),), pytest.approx(1.0))
+    more = credible({**worth, ("noise", "offset"): 1.2}, ("noise",), 0.9)[0]
+    assert set(more) == {("noise",), ("noise", "offset")}
+
+
 def test_the_accepted_set_is_never_counted_for_another():
     worth = {("wall",): 1.0, ("slope", "wall"): 1.0 - 1e-9}
     classes, probability = credible(worth, ("wall", "slope"), 0.9)

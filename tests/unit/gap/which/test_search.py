@@ -128,3 +128,26 @@ def test_a_step_that_was_begun_costs_no_look_and_no_refits(monkeypatch):
     steps = search._forward(problem, first, jax.random.key(0), Settings(), lambda _: None, begun=begun)
     assert looks == [("a",)]
     assert steps[-1].view.fitted is second
+
+
+@pytest.mark.parametrize(
+    ("gains", "first"),
+    [
+        ({("a", "b"): 10.0, ("a",): 9.5}, ("a",)),
+        ({("a", "b"): 12.0, ("a",): 9.5}, ("a", "b")),
+        ({("a", "b"): 10.0, ("c",): 9.5}, ("a", "b")),
+        ({("a", "b"): 10.0, (): 9.5}, ("a", "b")),
+    ],
+)
+def test_of_two_ways_the_one_without_an_idle_effect_stands(gains, first):
+    """What is worth most stands, unless one of its effects brings hardly anything."""
+    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "ab"])
+    base = SimpleNamespace(effects=(), log_evidence=0.0)
+    ways = [
+        [SimpleNamespace(view=SimpleNamespace(fitted=SimpleNamespace(effects=e, log_evidence=g)))]
+        for e, g in gains.items()
+    ]
+    for order in (ways, ways[::-1]):
+        found = search._ranked(problem, order, base)
+        assert found[0][-1].view.fitted.effects == first
+        assert sorted(map(id, found)) == sorted(map(id, ways))

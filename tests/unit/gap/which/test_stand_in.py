@@ -9,6 +9,7 @@ import pytest
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.settings import Settings
+from dtprob.gap.which.stand_in import _lead
 from dtprob.inference import Laplace
 from tests.unit.gap.examples import of_access_points
 
@@ -57,3 +58,11 @@ def test_an_effect_that_takes_up_a_part_of_unknown_levels_is_not():
     said = found(FIRST, 0.0, levels)
     assert said.verdict == "UNLISTED"
     assert not said.causes
+
+
+@pytest.mark.parametrize(
+    ("gain", "lead"), [(4.0, 3.0), (6.3, 3.15), (16.0, 8.0), (50.0, 8.0), (100.0, 15.0), (1e4, 1500.0)]
+)
+def test_how_much_better_than_one_effect_a_family_has_to_be(gain, lead):
+    """Half as much again where little was gained, eight nats, or a seventh of what was gained."""
+    assert _lead(gain) == pytest.approx(lead)
