@@ -88,7 +88,7 @@ def test_a_step_is_taken_over_from_the_same_fit_alone(effects, evidence, is_take
 @pytest.mark.parametrize(("goal", "is_revised"), [(-np.inf, True), (11.0, True), (30.0, False)])
 def test_choices_are_looked_at_again_near_a_goal_alone(monkeypatch, goal, is_revised):
     """Nine nats are within a quarter of eleven, and not of thirty."""
-    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "ab"])
+    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "abc"])
     first = SimpleNamespace(effects=(), log_evidence=0.0, within=lambda problem: problem)
     second = SimpleNamespace(effects=("a",), log_evidence=9.0, within=lambda problem: problem)
     revised = []
@@ -141,7 +141,7 @@ def test_a_step_that_was_begun_costs_no_look_and_no_refits(monkeypatch):
 )
 def test_of_two_ways_the_one_without_an_idle_effect_stands(gains, first):
     """What is worth most stands, unless one of its effects brings hardly anything."""
-    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "ab"])
+    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "abc"])
     base = SimpleNamespace(effects=(), log_evidence=0.0)
     ways = [
         [SimpleNamespace(view=SimpleNamespace(fitted=SimpleNamespace(effects=e, log_evidence=g)))]
