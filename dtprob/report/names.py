@@ -103,7 +103,8 @@ def whereabouts(site: Site) -> str:
     there, place = kinds.whereabouts(site.get("family", "")), place_words(site)
     if there is None:
         return place
-    return f" ({words(there)}, {place.removeprefix(' (')}" if place else f" ({words(there)})"
+    along = _pattern_words(there)
+    return f" ({along}, {place.removeprefix(' (')}" if place else f" ({along})"
 
 
 def moment(site: Site) -> str | None:
@@ -141,16 +142,21 @@ def allowance(remainder: Remainder) -> str:
     return f"it lets {listing(said)}"
 
 
+def _pattern_words(pattern: str) -> str:
+    """How a site family varies, its columns as words; brackets are places in columns, as in `x[2]`, not instances."""
+    return " ".join(_CAPITALS.get(word, word) for word in pattern.replace("_", " ").split(" "))
+
+
 def _varying(pattern: str) -> str:
     """How a site family varies, in words: `from link to link`, `as a ripple in time`, `at hour 3 to 5`."""
     first, _, rest = pattern.partition(" ")
     if first in _WAYS:
-        return _WAYS[first].format(whole=words(pattern), rest=words(rest))
+        return _WAYS[first].format(whole=_pattern_words(pattern), rest=_pattern_words(rest))
     if " times " in pattern:
-        return f"with {words(pattern)}"
+        return f"with {_pattern_words(pattern)}"
     if re.search(r" \d", pattern):  # a place
-        return f"at {words(pattern)}"
-    axes = [words(axis) for axis in pattern.split(" x ")]
+        return f"at {_pattern_words(pattern)}"
+    axes = [_pattern_words(axis) for axis in pattern.split(" x ")]
     if len(axes) == 1:
         return f"from {axes[0]} to {axes[0]}"
     return f"with every {listing(axes)} together"

@@ -45,8 +45,15 @@ class Story:
 def tell(report: Report) -> Story:
     """The story of a report's verdict; its headline is the report's own summary where it has one."""
     story = _STORIES[report["verdict"]](report)
-    headline = spoken(report["summary"], _codes(report)) if "summary" in report else story.headline
+    headline = (
+        _sentences(spoken(report["summary"], _codes(report))) if "summary" in report else story.headline
+    )
     return replace(story, headline=headline)
+
+
+def _sentences(text: str) -> str:
+    """The text with a capital after each full stop: a code name may have stood there."""
+    return ". ".join(map(capital, text.split(". ")))
 
 
 def _codes(report: Report) -> set[str]:

@@ -223,8 +223,9 @@ def test_the_place_that_stands_out_is_told_in_words() -> None:
         ("additive, slot 408 to 435", " (slot 408 to 435)"),
         ("spread, device 17, reading 438 to 468", " (device 17, reading 438 to 468)"),
         ("relative, along day by access_point", " (along day by access point)"),
-        ("additive, over snr and load", " (over snr and load)"),
+        ("additive, over snr and load", " (over SNR and load)"),
         ("additive, every 4 along episode and slot", " (every 4 along episode and slot)"),
+        ("additive, x[2] 2, x[0] -39.7 to -18.8", " (x[2] 2, x[0] -39.7 to -18.8)"),
         ("additive, ripple in day, 9 to 16 half waves", ""),
         ("dependence on those 2 before along report, each", ""),
         ("additive, by access_point", ""),
@@ -239,6 +240,15 @@ def test_it_is_told_where_or_along_what_a_site_is_wrong(family: str, told: str) 
     assert names.whereabouts({**site, "place": "row 9"}) == most
     report = {**_unlisted(), "unlisted": {"p_value": 1e-9, "sites": ["mean"], "located": [site]}}
     assert f"lies in the {names.located_words(site)}{told}" in tell(report).meaning
+
+
+def test_a_sentence_that_begins_with_a_code_name_begins_with_a_capital() -> None:
+    said = "There is a gap, and none of the known effects explains it. iq_imbalance and stale_map[a] imitate part of it."
+    report = {**_report(), "verdict": "UNLISTED", "summary": said}
+    report["causes"][0]["effects"] = ["iq_imbalance", "stale_map[a]"]
+    assert tell(report).headline.endswith(" explains it. I/Q imbalance and stale map (a) imitate part of it.")
+    report["causes"][0]["effects"], report["summary"] = ["stale_map"], "There is one. stale_map imitates it."
+    assert tell(report).headline == "There is one. Stale map imitates it."
 
 
 def test_values_that_are_read_too_often_call_for_what_makes_them() -> None:
