@@ -149,7 +149,8 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     fraction = closed.closed_fraction(*held, floor, keys[2]) if last.fitted.effects else None
     parts = shares(last.problem, last.fitted, held, assignment, keys[2]) if fraction is not None else ()
     rest = None
-    if settings.remainder and remains:  # by scores alone little is left where a wide spread hides it
+    # even if scores say that little is left, as where a wide spread hides it
+    if settings.remainder and any(site.can_be_modelled for site in wrong):
         say("modelling what is left at its site")
         rest = model_remainder(last, folds, held_after, floor.best, keys[2])
     if rest is not None:

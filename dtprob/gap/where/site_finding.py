@@ -51,6 +51,18 @@ class SiteFinding:
         return moment(self.family)
 
     @property
+    def is_ripple(self) -> bool:
+        """Whether it varies in ripples, which find any reading that is far off."""
+        return "ripple" in self.family
+
+    @property
+    def can_be_modelled(self) -> bool:
+        """Whether a model of the remainder may say something: not of what nothing moves, nor of ripples that follow it."""
+        return self.gain is not None and not (
+            self.last and self.is_ripple and (self.spreads or self.moment is not None)
+        )
+
+    @property
     def repeats(self) -> bool:
         """Whether readings are exactly alike, which no wrong value or spread makes them."""
         return self.moment == "repeats"
@@ -102,7 +114,7 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
         replace(
             f,
             last=(of_values <= SURE and is_value == by_noise and not f.repeats)
-            or (strays and not is_value and "ripple" in f.family),
+            or (strays and not is_value and f.is_ripple),
         )
         for f, is_value in zip(findings, values, strict=True)
     ]

@@ -102,3 +102,5 @@ def test_ripples_of_a_spread_follow_far_readings(family: str, p_of_tails: float,
     found = sorted(shadows_last([spread, deviation, tails], 1.0), key=rank)
     assert (found[0].moment != "tails") == is_first
     assert [f.last for f in found if f.moment != "tails"] == [not is_first] * 2
+    assert [f.can_be_modelled for f in found if f.moment != "tails"] == [is_first] * 2
+    assert not any(f.can_be_modelled for f in found if f.moment == "tails")
