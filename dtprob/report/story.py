@@ -288,7 +288,10 @@ def advice(effect: str) -> str:
 def _seat(report: Report) -> str:
     """` and lies in the path delays (along time, most of it at link 3)`, where the remainder or the gap was located."""
     left = left_over(report) or significant(report["where"]["sites"])[:1]
-    return f" and lies in the {listing(map(located_words, left[:2]))}{whereabouts(left[0])}" if left else ""
+    if not left:
+        return ""
+    first = f"{located_words(left[0])}{whereabouts(left[0])}"
+    return f" and lies in the {listing([first, *map(located_words, left[1:2])])}"
 
 
 _COUNTS = {1: "one", 2: "two", 3: "three", 4: "four", 5: "five"}
