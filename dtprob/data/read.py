@@ -131,8 +131,8 @@ def _powers(arrays: Arrays, *, matlab: bool) -> PowerData:
     if decibels is not None and reference is not None:
         if "power" in arrays:
             raise InputError("power_db", "either power or power_db", "both", "Leave one of them out")
-        check_kind("power_db", decibels, "real")
-        check_kind("power_reference", reference, "real")
+        _numeric("power_db", decibels)
+        _numeric("power_reference", reference)
         if reference.size != 1:
             raise InputError(
                 "power_reference", "one number", f"shape {reference.shape}", "Give the power of 0 dB"
@@ -143,6 +143,13 @@ def _powers(arrays: Arrays, *, matlab: bool) -> PowerData:
         if name not in POWER_ARRAYS:
             raise unknown_name("array", name, valid, "array name")
     return PowerData(**_canonical(arrays, POWER_ARRAYS, matlab=matlab))
+
+
+def _numeric(name: str, array: np.ndarray) -> None:
+    """Refuse what is no real number; of yes and no nobody knows what they measure."""
+    check_kind(name, array, "real")
+    if array.dtype.kind == "b":
+        raise InputError(name, "real numbers", "yes and no", f"Store {name} as real numbers")
 
 
 def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
@@ -164,7 +171,7 @@ def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
     arrays = _canonical(arrays, LABEL_ARRAYS, matlab=matlab)
     if arrays["x"].ndim == 1:
         arrays["x"] = arrays["x"][:, None]
-    check_kind("y", arrays["y"], "real")
+    _numeric("y", arrays["y"])
     y = np.asarray(arrays["y"], dtype=float)
     labelled = ~np.isnan(y)
     others = {name: arrays.get(name) for name in optional}

@@ -229,11 +229,7 @@ def _leaves_moments(evidence: Evidence, level: float) -> bool:
     """Whether all that is left is how observations spread, of which what moves only expectations is no imitation."""
     left = [s for s in evidence.after.sites if s.p_value <= level and not s.last]
     locating = evidence.steps[0].view.screening.scores.locating
-    return (
-        bool(left)
-        and set(evidence.accepted) <= locating
-        and all(s.spreads or s.moment is not None for s in left)
-    )
+    return bool(left) and set(evidence.accepted) <= locating and not any(s.is_of_values for s in left)
 
 
 def _hides(evidence: Evidence, level: float) -> bool:
@@ -242,7 +238,7 @@ def _hides(evidence: Evidence, level: float) -> bool:
     Beside a twin that is far too sure of itself any noise closes nearly all of a gap.
     """
     rest, locating = evidence.remainder, evidence.steps[0].view.screening.scores.locating
-    values = [s for s in evidence.after.sites if s.p_value <= level and not s.spreads and s.moment is None]
+    values = [s for s in evidence.after.sites if s.p_value <= level and s.is_of_values]
     if rest is None or not values or not locating.isdisjoint(evidence.accepted):
         return False
     return rest.beside < _IDLE * (evidence.fitted.log_evidence - evidence.base.log_evidence)

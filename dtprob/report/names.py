@@ -95,16 +95,21 @@ def located_words(site: Site) -> str:
 
 def place_words(site: Site) -> str:
     """` (most of it at access point 11)`, where one entry of a site stands out."""
-    return f" (most of it at {site['place'].replace('_', ' ')})" if "place" in site else ""
+    return _in_brackets(_foremost(site))
 
 
 def whereabouts(site: Site) -> str:
     """The same, and along what or where a site is wrong: ` (along day by access point, most of it at access point 11)`."""
-    there, place = kinds.whereabouts(site.get("family", "")), place_words(site)
-    if there is None:
-        return place
-    along = _pattern_words(there)
-    return f" ({along}, {place.removeprefix(' (')}" if place else f" ({along})"
+    there = kinds.whereabouts(site.get("family", ""))
+    return _in_brackets([*([_pattern_words(there)] if there else []), *_foremost(site)])
+
+
+def _foremost(site: Site) -> list[str]:
+    return [f"most of it at {site['place'].replace('_', ' ')}"] if "place" in site else []
+
+
+def _in_brackets(told: Sequence[str]) -> str:
+    return f" ({', '.join(told)})" if told else ""
 
 
 def moment(site: Site) -> str | None:

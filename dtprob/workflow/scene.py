@@ -84,9 +84,9 @@ def paths_of(
         paths = _same_links(storage.load(scene.file), _placed(scene, data), case)
         _check_tones(paths.frequency, data)
         return paths
-    kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
     if scene.frequency is not None:
         _check_tones(scene.frequency, data)
+    kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
     if kept is not None and kept.is_file():
         say(f"taking the paths that were traced before, {kept.name}")
         return storage.load(kept)

@@ -162,13 +162,13 @@ def _contradicted(problem: Problem, fitted: Fit) -> list[str]:
     asked, index = ~are_states(problem, active), active.global_index
     spread = problem.prior_spread
     away = np.abs(fitted.x - spread.middle) / np.maximum(spread.deviation, 1e-300)
-    beyond = (away > _CONTRADICTED) & (fitted.x > spread.largest)
+    below, beyond = (
+        (away > _CONTRADICTED) & far for far in (fitted.x < spread.least, fitted.x > spread.largest)
+    )
     for block in (b for b in active.blocks if not b.local and b.owner is None):
         kind = base_constraint(problem.declaration.sites[block.name].support)
         if kind is constraints.real:
-            beyond[block.index] |= (away > _CONTRADICTED)[block.index] & (fitted.x < spread.least)[
-                block.index
-            ]
+            beyond[block.index] |= below[block.index]
         elif not isinstance(kind, type(constraints.positive)):
             beyond[block.index] = False
     told = [(owner, i) for owner, i, is_asked in zip(_names(active), index, asked, strict=True) if is_asked]

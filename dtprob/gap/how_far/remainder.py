@@ -77,7 +77,7 @@ class Remainder:
     held: HeldOut
     before: Calibration
     after: Calibration
-    beside: float = np.inf
+    beside: float
 
 
 def model_remainder(

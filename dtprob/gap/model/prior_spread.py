@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, final
 
 import numpy as np
@@ -41,7 +42,7 @@ class PriorSpread:
         """The median."""
         return self._at(0.0)
 
-    @property
+    @cached_property
     def deviation(self) -> Float[np.ndarray, " dimension"]:
         """The standard deviation by the middle eight tenths."""
         return (self._at(_TENTH) - self._at(-_TENTH)) / (2 * _TENTH)

@@ -51,6 +51,11 @@ class SiteFinding:
         return moment(self.family)
 
     @property
+    def is_of_values(self) -> bool:
+        """Whether values are wrong, and not how observations spread about them, by whatever name."""
+        return self.moment is None and not self.spreads
+
+    @property
     def is_ripple(self) -> bool:
         """Whether it varies in ripples, which find any reading that is far off."""
         return "ripple" in self.family
@@ -58,9 +63,7 @@ class SiteFinding:
     @property
     def can_be_modelled(self) -> bool:
         """Whether a model of the remainder may say something: not of what nothing moves, nor of ripples that follow it."""
-        return self.gain is not None and not (
-            self.last and self.is_ripple and (self.spreads or self.moment is not None)
-        )
+        return self.gain is not None and (self.is_of_values or not (self.last and self.is_ripple))
 
     @property
     def repeats(self) -> bool:
@@ -80,7 +83,7 @@ def most_left(found: Iterable[SiteFinding]) -> float:
     that is far too small the first order tells a fraction. Not where it may be the shadow of another site.
     """
     sites = tuple(found)
-    moments = (one for one in sites if (one.spreads or one.moment is not None) and not one.last)
+    moments = (one for one in sites if not (one.is_of_values or one.last))
     told = (-math.log(max(one.p_value, 1e-300)) for one in moments)
     return max(most_gained(sites), max(told, default=0.0))
 
@@ -101,22 +104,21 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
 
     Ripples of a spread come last where tails are what is wrong: the finest ones find any reading that is far off.
 
-    A site that says how observations spread is one of their moments, by whatever name. Where p-values end values come last
-    if their scores are no larger than noise of such an energy (of the residuals, over its expectation) makes them.
+    Where p-values end values come last if their scores are no larger than noise of such an energy (of the residuals, over its
+    expectation) makes them.
     """
-    values = [f.moment is None and not f.spreads for f in findings]
-    of_values = min((f.p_value for f, one in zip(findings, values, strict=True) if one), default=1.0)
-    of_moments = min((f.p_value for f, one in zip(findings, values, strict=True) if not one), default=1.0)
-    score = max((f.score for f, one in zip(findings, values, strict=True) if one), default=0.0)
+    of_values = min((f.p_value for f in findings if f.is_of_values), default=1.0)
+    of_moments = min((f.p_value for f in findings if not f.is_of_values), default=1.0)
+    score = max((f.score for f in findings if f.is_of_values), default=0.0)
     by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
     strays = any(f.moment == "tails" and f.p_value <= _FAR_READINGS for f in findings)
     return [
         replace(
             f,
-            last=(of_values <= SURE and is_value == by_noise and not f.repeats)
-            or (strays and not is_value and f.is_ripple),
+            last=(of_values <= SURE and f.is_of_values == by_noise and not f.repeats)
+            or (strays and f.is_ripple and not f.is_of_values),
         )
-        for f, is_value in zip(findings, values, strict=True)
+        for f in findings
     ]
 
 

@@ -123,16 +123,17 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
 
 def _ranked(problem: Problem, ways: Sequence[list[Step]], base: fitting.Fit) -> list[list[Step]]:
     """The way whose end has most credit first, but one before it whose end lacks effects that bring hardly any."""
-    worth = [credit(problem, way[-1].view.fitted, base) for way in ways]
-    ordered = [ways[i] for i in sorted(range(len(ways)), key=lambda i: -worth[i])]
-    most = set(ordered[0][-1].view.fitted.effects)
+    ends = [(credit(problem, way[-1].view.fitted, base), way) for way in ways]
+    ends.sort(key=lambda end: -end[0])
+    most, best_way = ends[0]
+    effects = set(best_way[-1].view.fitted.effects)
     plainer = (
         way
-        for value, way in zip(sorted(worth, reverse=True), ordered, strict=True)
-        if set() < set(way[-1].view.fitted.effects) < most and value > max(worth) - IDLE
+        for worth, way in ends
+        if set() < set(way[-1].view.fitted.effects) < effects and worth > most - IDLE
     )
-    first = next(plainer, ordered[0])
-    return [first, *(way for way in ordered if way is not first)]
+    first = next(plainer, best_way)
+    return [first, *(way for _, way in ends if way is not first)]
 
 
 def _reached(problem: Problem, ways: Sequence[Sequence[Step]], base: fitting.Fit) -> float:

@@ -87,6 +87,12 @@ def test_other_faults(tmp_path, columns, change, message):
         read(saved(tmp_path, change(columns)))
 
 
+def test_a_log_without_rows_is_named(tmp_path, columns):
+    columns.iloc[:0].to_parquet(tmp_path / "log.parquet")
+    with pytest.raises(InputError, match="expected at least one row, got an empty table"):
+        read(tmp_path / "log.parquet")
+
+
 def test_values_and_places_are_of_one_row_where_the_file_is_not_sorted(tmp_path):
     rows = [(1, 0, 0), (1, 1, 7), (0, 0, 0), (0, 1, 3)]
     columns = pd.DataFrame(rows, columns=["episode", "slot", "buffer_0"]).assign(

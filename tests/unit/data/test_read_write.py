@@ -403,6 +403,8 @@ def test_bad_powers_and_labels_are_named(tmp_path):
         PowerData(**(arrays | {"power": -arrays["power"]}))
     with pytest.raises(InputError, match="y: expected at least one label"):
         read(save(tmp_path / "b.npz", {"x": np.zeros(2), "y": np.full(2, np.nan)}))
+    with pytest.raises(InputError, match="y: expected real numbers, got yes and no"):
+        read(save(tmp_path / "d.npz", {"x": np.zeros(2), "y": np.array([True, False])}))
     with pytest.raises(InputError, match="x: expected finite numbers, got NaN"):
         read(save(tmp_path / "c.npz", {"x": np.array([0, np.nan]), "y": np.zeros(2)}))
 

@@ -88,7 +88,7 @@ def test_a_step_is_taken_over_from_the_same_fit_alone(effects, evidence, is_take
 @pytest.mark.parametrize(("goal", "is_revised"), [(-np.inf, True), (11.0, True), (30.0, False)])
 def test_choices_are_looked_at_again_near_a_goal_alone(monkeypatch, goal, is_revised):
     """Nine nats are within a quarter of eleven, and not of thirty."""
-    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "abc"])
+    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "ab"])
     first = SimpleNamespace(effects=(), log_evidence=0.0, within=lambda problem: problem)
     second = SimpleNamespace(effects=("a",), log_evidence=9.0, within=lambda problem: problem)
     revised = []
