@@ -120,11 +120,11 @@ def model_remainder(
 
 
 def _without(wider: Problem, full: fitting.Fit, causes: Sequence[str]) -> float:
-    """Log evidence of the model of the remainder alone."""
+    """Log evidence of the model of the remainder alone, which may have to do more than beside the causes."""
     x, null, rest = full.x.copy(), wider.null(), tuple(n for n in full.effects if n not in causes)
     for block in (b for b in wider.layout.blocks if b.owner in causes):
         x[block.index] = null[block.index]
-    spread = {n: s for n, s in full.spread.items() if n in rest}
+    spread = {n: max(full.spread[n], 1.0) for n in rest}
     return fitting.fit(wider, x, rest, spread=spread, tolerance=_COARSE).log_evidence
 
 

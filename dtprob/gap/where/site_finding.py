@@ -104,8 +104,8 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
 
     Ripples of a spread come last where tails are what is wrong: the finest ones find any reading that is far off.
 
-    Where p-values end values come last if their scores are no larger than noise of such an energy (of the residuals, over its
-    expectation) makes them.
+    Where p-values end values come last if their scores are no larger than noise of such an energy (of the residuals, over
+    its expectation) makes them.
     """
     of_values = min((f.p_value for f in findings if f.is_of_values), default=1.0)
     of_moments = min((f.p_value for f in findings if not f.is_of_values), default=1.0)

@@ -12,11 +12,11 @@ import numpyro.distributions as dist
 import pytest
 from scipy import stats
 
-from dtprob.effects.effect import FIELD
+from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.calibration import calibration
-from dtprob.gap.how_far.remainder import _has_to_be_positive, alone, model_remainder, shortlist
+from dtprob.gap.how_far.remainder import _has_to_be_positive, _without, alone, model_remainder, shortlist
 from dtprob.gap.how_far.site_field import field_of
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.along import curves
@@ -401,3 +401,25 @@ def test_a_law_as_large_as_the_levels_that_it_is_added_to():
     assert found is not None
     assert found.after.coverage == pytest.approx(0.9, abs=0.08)
     assert found.held.log_likelihood.sum() > 0.02 * held.log_likelihood.sum()  # both are negative
+
+
+@pytest.mark.parametrize("offset", [0.0, 2.0])
+def test_what_a_cause_brings_beside_a_model_of_the_remainder(offset):
+    """Against fits of both and of the remainder alone: nothing where it is not there, however far the fit has it."""
+    cause = Effect(
+        "half",
+        {"mean": lambda value, p, data: value + p["offset"] * (data["place"] > 0.5)},
+        (Parameter("offset", dist.Normal(0.0, 1.0)),),
+    )
+    problem = Problem(table, rows(1, lambda place, _: offset * (place > 0.5)), [cause], "street").with_live(
+        ["half"]
+    )
+    one = suspect(problem, "along x", 0.1)
+    wider = problem.with_fields([field_of(problem, "r[0]", one, positive=False)])
+    both = fitting.fit(wider, wider.null(), ["half", "r[0]"], spread={"r[0]": 1.0})
+    rest = fitting.fit(wider, wider.null(), ["r[0]"], spread={"r[0]": 1.0})
+    assert _without(wider, both, ("half",)) == pytest.approx(rest.log_evidence, abs=0.1)
+    if offset:
+        far = replace(both, x=np.where(both.x == 0, both.x, 3 * both.x))
+        assert both.log_evidence - rest.log_evidence > 50.0
+        assert _without(wider, far, ("half",)) == pytest.approx(rest.log_evidence, abs=0.1)
