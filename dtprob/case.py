@@ -190,6 +190,13 @@ class Case:
         return self.path.parent
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that this case reads, besides the user's own modules."""
+        scene = () if self.scene is None else (Path(self.scene.file),)
+        data = self.data
+        return tuple(file for file in (self.path, data.file, data.reference, data.designs, *scene) if file)
+
+    @property
     def user_code(self) -> tuple[str, ...]:
         """The user's own functions that this case runs, as "module:name"."""
         use = self.effects.use
@@ -241,11 +248,12 @@ def read_document(path: Path) -> dict[str, Any]:
             raise InputError(str(path), "a CASE file (TOML)", "a folder", f"Name the file: {inside[0]}")
         if not path.is_file():
             raise InputError(str(path), "a CASE file (TOML)", "no such file", "Check the name and the folder")
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except UnicodeDecodeError:
-        raise InputError(
-            str(path), "a CASE file (TOML)", "no text", "Name the TOML file, not the data"
-        ) from None
+        return tomllib.loads(path.read_text(encoding="utf-8-sig"))
+    except UnicodeDecodeError as error:
+        is_toml = path.suffix.lower() == ".toml"
+        got = f"another encoding (byte {error.start})" if is_toml else "no text"
+        remedy = "Save it as UTF-8" if is_toml else "Name the TOML file, not the data"
+        raise InputError(str(path), "a CASE file (TOML), in UTF-8", got, remedy) from None
     except tomllib.TOMLDecodeError as error:
         raise InputError(str(path), "a TOML file", str(error), "Correct the file there") from None
     except OSError as error:

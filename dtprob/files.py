@@ -3,7 +3,8 @@
 import hashlib
 import os
 import secrets
-from collections.abc import Generator
+import tempfile
+from collections.abc import Generator, Iterable
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -43,17 +44,37 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
 
 
 def make_folder(out: Path) -> None:
-    """Make the folder of the results, before work that would be lost without it.
+    """Make the folder of the results, and try to write into it, before work that would be lost without it.
 
     Raises:
         InputError: a file of that name, or no permission.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=out):
+            pass
     except OSError as error:
-        raise InputError(
-            f"--out {out}", "a folder", error.strerror or str(error), "Choose another folder"
-        ) from None
+        expected, got = "a folder that can be written to", error.strerror or str(error)
+        raise InputError(f"--out {out}", expected, got, "Choose another folder") from None
+
+
+def check_apart(out: Path, results: Iterable[str], inputs: Iterable[Path]) -> None:
+    """Refuse a folder in which a result would take the place of an input.
+
+    Args:
+        out: the folder of the results.
+        results: names of the files that will be written there, or removed.
+        inputs: the files that are read.
+
+    Raises:
+        InputError: such a folder.
+    """
+    written = {(out / name).resolve(): name for name in results}
+    for file in inputs:
+        if file.resolve() in written:
+            got = f"{written[file.resolve()]}, which is read"
+            expected = "a folder where no result takes the place of an input"
+            raise InputError(f"--out {out}", expected, got, "Choose another folder")
 
 
 def sha256(path: Path) -> str:

@@ -1,12 +1,12 @@
 """`dtprob demo`: the diagnosis of a recorded case that comes with the package."""
 
-import shutil
 from importlib import resources
 from pathlib import Path
 
 from dtprob.case import load_case
 from dtprob.commands import diagnose
-from dtprob.files import make_folder
+from dtprob.errors import InputError
+from dtprob.files import atomic_write, make_folder
 
 FILES = ("case.toml", "channels.npz", "paths.nc", "truth.json")
 
@@ -16,11 +16,17 @@ def run(out: Path) -> None:
 
     Args:
         out: the folder of the results.
+
+    Raises:
+        InputError: a folder that cannot be written to, or has other files of these names.
     """
-    folder = out / "case"
+    folder, recorded = out / "case", resources.files("dtprob.data") / "demo"
     make_folder(folder)
-    for name in FILES:
-        with resources.as_file(resources.files("dtprob.data") / "demo" / name) as file:
-            shutil.copyfile(file, folder / name)
-    case = load_case(folder / "case.toml")
-    diagnose.run(case, out, engine=None, seed=None, no_code=True, resume=False)
+    content = {folder / name: (recorded / name).read_bytes() for name in FILES}
+    for file, whole in content.items():
+        if file.exists() and file.read_bytes() != whole:
+            raise InputError(f"{file}", "none, or the demo's", "another file", "Choose another folder")
+    for file, whole in content.items():
+        with atomic_write(file) as temporary:
+            temporary.write_bytes(whole)
+    diagnose.run(load_case(folder / "case.toml"), out, engine=None, seed=None, no_code=True, resume=False)

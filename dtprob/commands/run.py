@@ -4,8 +4,9 @@ import warnings
 from collections.abc import Generator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Final, Literal
 
 import jax
 
@@ -13,9 +14,17 @@ from dtprob.case import Case, EngineSection, check_seed
 from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
-from dtprob.files import make_folder, sha256, write_text
+from dtprob.errors import InputError
+from dtprob.files import check_apart, make_folder, sha256, write_text
 from dtprob.inference import LATENTS_ONLY, Posterior, RunOptions
 from dtprob.workflow import Prepared, prepare
+
+_BESIDE: Final = (".nc", ".identity", ".begun", ".checkpoint", ".status.json")
+"""How the files of a posterior end, and those that lie beside it while it is made."""
+
+
+_PARTS: Final = ("dtprob", "engine or setting of it", "case", "data file", "code of its own or scene")
+"""What a posterior depends on."""
 
 
 @dataclass(frozen=True)
@@ -70,11 +79,14 @@ def prepare_case(case: Case, run: Run, need: Literal["fit", "diagnosis"], result
         results: the names of the files that will be written.
 
     Raises:
-        InputError: see ``dtprob.workflow.prepare``, or a folder that cannot be made.
+        InputError: see ``dtprob.workflow.prepare``, or a folder that cannot be written to, or where a result would take the
+            place of what the case reads.
     """
     if case.user_code and run.allow_code:
         run.say(f"this case runs code of its own: {', '.join(case.user_code)}")
     make_folder(run.out)
+    posterior = "posterior" if need == "fit" else "reference"
+    check_apart(run.out, (*results, *(posterior + end for end in _BESIDE)), case.files)
     prepared = prepare(case, need=need, allow_code=run.allow_code, cache=run.out, say=run.say)
     for name in results:
         (run.out / name).unlink(missing_ok=True)
@@ -92,15 +104,23 @@ def infer(
         file: where to keep the posterior; beside it lie, while it is being made, a checkpoint and a status.
         run: whether to resume, and how to tell the progress.
         latents_only: keep draws of what is unknown, and nothing that has an entry for each row of the data.
+
+    Raises:
+        InputError: a checkpoint to resume from that another run left.
     """
     identity, own = file.with_suffix(".identity"), _identity(prepared, file)
     if run.resume and file.is_file() and _read(identity) == own:
         run.say(f"{file.name} is there already")
         return Posterior.load(file)
     checkpoint, status, begun = (file.with_suffix(end) for end in (".checkpoint", ".status.json", ".begun"))
-    resume = run.resume and checkpoint.is_file() and _read(begun) == own
-    if run.resume and checkpoint.is_file() and not resume:
-        run.say("what the case is made of has changed since the checkpoint: beginning anew")
+    resume = run.resume and checkpoint.is_file()
+    if resume and _read(begun) != own:
+        raise InputError(
+            f"{checkpoint}",
+            "a run of the same case by the same state of dtprob",
+            f"another {_first_difference(_read(begun) or '', own)}",
+            "Give what it was begun with, or leave out --resume to begin anew",
+        )
     if not resume:
         checkpoint.unlink(missing_ok=True)  # else it would pass for one of the run that is begun now
     write_text(begun, own)
@@ -123,11 +143,17 @@ def infer(
 
 
 def _identity(prepared: Prepared, file: Path) -> str:
-    """What a kept posterior depends on, as text."""
+    """What a kept posterior depends on, a line for each of `_PARTS`."""
     reference = prepared.case.data.reference
-    made_from = prepared.data_sha256 if file.stem == "posterior" or not reference else sha256(reference)
-    made_from += f"\n{prepared.made_of_sha256}"
-    return f"dtprob {edition()}\n{prepared.engine!r}\n{prepared.case!r}\n{made_from}\n"
+    data = prepared.data_sha256 if file.stem == "posterior" or not reference else sha256(reference)
+    parts = (edition(), repr(prepared.engine), repr(prepared.case), data, prepared.made_of_sha256)
+    return "".join(f"{part}\n" for part in parts)
+
+
+def _first_difference(begun: str, own: str) -> str:
+    """The first part in which two identities differ."""
+    pairs = zip_longest(begun.splitlines(), own.splitlines())
+    return next(name for name, (one, other) in zip(_PARTS, pairs, strict=False) if one != other)
 
 
 def _read(file: Path) -> str | None:

@@ -12,7 +12,7 @@ from dtprob.case import check_seed
 from dtprob.commands.run import session
 from dtprob.control import TablePolicy, export
 from dtprob.data import NetworkLog, write
-from dtprob.files import make_folder, write_text
+from dtprob.files import check_apart, make_folder, write_text
 from dtprob.workflow.loop import (
     State,
     Twin,
@@ -47,12 +47,14 @@ def run(twin_case: Path, out: Path, *, seed: int | None, no_code: bool, resume: 
         resume: go on with what an interrupted run left in ``out``.
 
     Raises:
-        InputError: a case, a log, an environment or a state that cannot be used.
+        InputError: a case, a log, an environment or a state that cannot be used; or a folder where a result would take the
+            place of what is read.
     """
     case = load_twin_case(twin_case)
     if seed is not None:
         case = replace(case, seed=replace(case.seed, value=check_seed(seed)))
     make_folder(out)
+    check_apart(out, (*RESULTS, _STATE), case.files)
     with session() as say, jax.enable_x64(False):
         if case.user_code and not no_code:
             say(f"this case runs code of its own: {', '.join(case.user_code)}")

@@ -92,7 +92,8 @@ def run(
         resume: keep the answers that are there, where case, seed and dtprob's own code are what they were.
 
     Raises:
-        InputError: no cases, a number of workers below 1, a seed below 0, or answers that are no folder.
+        InputError: no cases, a number of workers below 1, a seed below 0, or answers that are no folder, or that of the
+            cases.
         RuntimeError: some cases could not be diagnosed; why lies in OUT/NAME/error.txt.
     """
     if workers < 1:
@@ -104,6 +105,9 @@ def run(
         )
     if seed is not None:
         check_seed(seed)
+    if out.resolve() == cases.resolve():
+        expected = "a folder apart from the cases"
+        raise InputError(f"--out {out}", expected, "that of the cases", "Choose another folder")
     make_folder(out)
     wanted = ("report.json", "rivals.json") if rivals else ("report.json",)
     jobs = [_Job(cases / n, out / n, wanted, seed=seed, no_code=no_code, resume=resume) for n in found]
@@ -132,13 +136,13 @@ def score(answers: Path, key: Path) -> None:
     Raises:
         InputError: no key, or answers that do not belong to it.
     """
-    from dtprob.gap.withheld.score import score as scored  # noqa: PLC0415  (heavy)
+    from dtprob.gap.withheld.score import check_key  # noqa: PLC0415  (heavy)
+    from dtprob.gap.withheld.score import score as scored  # noqa: PLC0415
     from dtprob.report.score_page import render_score  # noqa: PLC0415
 
     content = _json(key)
-    names = [str(case.get("name")) for case in content.get("cases", [])]
     ended = ("report.json", "error.txt")  # without either the case was broken off
-    there = [name for name in names if any((answers / name / file).is_file() for file in ended)]
+    there = [name for name in check_key(content) if any((answers / name / file).is_file() for file in ended)]
     files = ("report.json", "timing.json", "rivals.json")
     reports, timings, rivals = ({name: _optional(answers / name / file) for name in there} for file in files)
     seconds = {name: timing["seconds"] for name, timing in timings.items() if timing}

@@ -55,11 +55,14 @@ class Auto(AbstractEngine):
 
     draws: int = 1000
 
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        check_counts(self, {"draws": 1})
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, {"draws": 1})
         check_key(key)
         engine, reason = choose(model, data, draws=self.draws)
         posterior = engine(key, model, data, options=options)

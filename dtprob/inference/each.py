@@ -24,10 +24,9 @@ from dtprob.inference.assemble import (
 )
 from dtprob.inference.build import build_target, prior_units
 from dtprob.inference.chains import stacked_axes
-from dtprob.inference.engine import DEFAULT, AbstractEngine, RunOptions, check_counts, check_key
+from dtprob.inference.engine import DEFAULT, AbstractEngine, RunOptions, check_key
 from dtprob.inference.fit import resolve
 from dtprob.inference.hamiltonian import AbstractHamiltonian
-from dtprob.inference.laplace import COUNTS as LAPLACE_COUNTS
 from dtprob.inference.laplace import Laplace, approximate
 from dtprob.inference.modes import search, starting_points
 from dtprob.inference.posterior import Posterior, Values
@@ -150,9 +149,7 @@ def _checked(engine: AbstractEngine, options: RunOptions) -> AbstractHamiltonian
     if not isinstance(engine, AbstractHamiltonian | Laplace):
         remedy = "Call fit for each data set; what is compiled for the first serves the others"
         raise InputError(what, "laplace, hmc, nuts or blackjax_nuts", engine.name, remedy)
-    if isinstance(engine, Laplace):
-        check_counts(engine, LAPLACE_COUNTS)
-    elif engine.enough_ess:
+    if not isinstance(engine, Laplace) and engine.enough_ess:
         raise InputError(what, "no early stop", f"enough_ess {engine.enough_ess}", "Leave enough_ess at 0")
     if options.checkpoint is not None:
         raise InputError(what, "no checkpoint", str(options.checkpoint), "Fit fewer data sets at once")

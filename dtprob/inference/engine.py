@@ -47,7 +47,10 @@ class RunOptions:
     max_entries: int = 20_000_000
 
     def __post_init__(self) -> None:
-        """Refuse settings that cannot work."""
+        """Names of files as paths; settings that cannot work are refused."""
+        for name in ("status_file", "checkpoint"):
+            if (file := getattr(self, name)) is not None:
+                object.__setattr__(self, name, Path(file))
         if self.chunk is not None and self.chunk < 1:
             raise InputError("chunk of a run", "1 or more draws", str(self.chunk), "Give a positive number")
         if self.resume and self.checkpoint is None:
@@ -62,8 +65,8 @@ LATENTS_ONLY = RunOptions(deterministics=False, pointwise=False)
 class AbstractEngine(abc.ABC):
     """Something that turns a model and data into a posterior.
 
-    A concrete engine is a frozen dataclass whose fields are its settings. Calling it twice with the same key,
-    model and data gives the same draws.
+    A concrete engine is a frozen dataclass whose fields are its settings; what cannot work is refused when it is made.
+    Calling it twice with the same key, model and data gives the same draws.
 
     Attributes:
         name: the engine's name in `ENGINES`, on the command line and in provenance.
@@ -128,6 +131,19 @@ def check_choice(engine: AbstractEngine, setting: str, choices: Sequence[str]) -
     value = getattr(engine, setting)
     if value not in choices:
         raise unknown_name(f"{setting} of engine {engine.name}", str(value), choices, "choice")
+
+
+def check_initial(initial: Any) -> None:
+    """Check that values to start from are given by the names of sites, where there are any.
+
+    Raises:
+        InputError: anything else.
+    """
+    if initial is not None and not isinstance(initial, Mapping):
+        remedy = "Write initial = { SITE = VALUE }"
+        raise InputError(
+            "initial values of an engine", "a value for each site by name", repr(initial), remedy
+        )
 
 
 def check_key(key: jax.Array) -> jax.Array:

@@ -31,6 +31,7 @@ from dtprob.inference.engine import (
     RunOptions,
     check_choice,
     check_counts,
+    check_initial,
     check_key,
 )
 from dtprob.inference.iterate import Job, Steps, iterate
@@ -113,12 +114,21 @@ class Ensemble(AbstractEngine):
     initial: Mapping[str, Any] | None = None
     max_steps: int = 200
 
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        check_counts(self, {"members": 1, "starts": 1, "max_steps": 1})
+        check_choice(self, "resample", ("auto", *get_args(Scheme.__value__)))
+        check_initial(self.initial)
+        if self.base == "point" and self.settings:
+            remedy = "Set starts, initial and max_steps of the ensemble itself"
+            raise InputError(
+                "settings of engine ensemble", "none with base point", str(dict(self.settings)), remedy
+            )
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, {"members": 1, "starts": 1, "max_steps": 1})
-        check_choice(self, "resample", ("auto", *get_args(Scheme.__value__)))
         check_key(key)
         target, inputs = build_target(model, data)
         is_point = self.base == "point"

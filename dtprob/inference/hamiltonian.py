@@ -11,7 +11,15 @@ import jax
 
 from dtprob.errors import InputError
 from dtprob.inference.chains import ChainMethod
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_choice, check_counts
+from dtprob.inference.engine import (
+    DEFAULT,
+    AbstractEngine,
+    Answer,
+    RunOptions,
+    check_choice,
+    check_counts,
+    check_initial,
+)
 from dtprob.inference.enough import Enough
 from dtprob.inference.kernel import Kernel
 from dtprob.inference.posterior import Posterior
@@ -58,17 +66,17 @@ class AbstractHamiltonian(AbstractEngine):
     def kernel(self, warmup: int) -> Kernel:
         """The transition, which adapts itself in the first `warmup` steps."""
 
-    def schedule(self) -> Schedule:
-        """How long a run is.
-
-        Raises:
-            InputError: a setting is too small, or no choice.
-        """
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
         if not 0 < self.target_accept < 1:
             what, got = f"target_accept of engine {self.name}", f"{self.target_accept:g}"
             raise InputError(what, "a rate between 0 and 1", got, "Give a rate, such as 0.8")
         check_counts(self, {"chains": 1, "warmup": 0, "draws": 1, **self.least})
         check_choice(self, "chain_method", get_args(ChainMethod.__value__))
+        check_initial(self.initial)
+
+    def schedule(self) -> Schedule:
+        """How long a run is."""
         enough = Enough(self.enough_ess, self.enough_rhat)
         return Schedule(self.chains, self.warmup, self.draws, self.chain_method, self.initial, enough)
 

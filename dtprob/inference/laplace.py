@@ -17,7 +17,15 @@ from jaxtyping import Array, Float
 from dtprob.errors import InputError
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
-from dtprob.inference.engine import DEFAULT, AbstractEngine, Answer, RunOptions, check_counts, check_key
+from dtprob.inference.engine import (
+    DEFAULT,
+    AbstractEngine,
+    Answer,
+    RunOptions,
+    check_counts,
+    check_initial,
+    check_key,
+)
 from dtprob.inference.modes import find_mode, objective_value
 from dtprob.inference.optimise import curvature, gradient_and_hessian
 from dtprob.inference.posterior import Posterior
@@ -75,11 +83,15 @@ class Laplace(AbstractEngine):
     initial: Mapping[str, Any] | None = None
     max_steps: int = 200
 
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        check_counts(self, COUNTS)
+        check_initial(self.initial)
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, COUNTS)
         search_key, draw_key = jax.random.split(check_key(key))
         target, inputs = build_target(model, data)
         if target.dimension > LARGEST:

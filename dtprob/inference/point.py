@@ -17,6 +17,7 @@ from dtprob.inference.engine import (
     RunOptions,
     check_choice,
     check_counts,
+    check_initial,
     check_key,
 )
 from dtprob.inference.modes import find_mode
@@ -48,12 +49,16 @@ class Point(AbstractEngine):
     initial: Mapping[str, Any] | None = None
     max_steps: int = 200
 
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        check_counts(self, {"starts": 1, "max_steps": 1})
+        check_choice(self, "objective", ("map", "maximum_likelihood"))
+        check_initial(self.initial)
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, {"starts": 1, "max_steps": 1})
-        check_choice(self, "objective", ("map", "maximum_likelihood"))
         target, inputs = build_target(model, data)
         mode = find_mode(
             target,

@@ -100,15 +100,18 @@ class SMC(AbstractEngine):
     leapfrog: int = 8
     max_temperatures: int = 200
 
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        check_counts(self, {"draws": 2, "chains": 1, "moves": 1, "leapfrog": 1, "max_temperatures": 1})
+        if not 0 < self.target_ess < 1:
+            remedy = "Give a share, such as 0.5"
+            raise InputError("target_ess of engine smc", "between 0 and 1", str(self.target_ess), remedy)
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, {"draws": 2, "chains": 1, "moves": 1, "leapfrog": 1, "max_temperatures": 1})
         check_key(key)
-        if not 0 < self.target_ess < 1:
-            remedy = "Give a share, such as 0.5"
-            raise InputError("target_ess of engine smc", "between 0 and 1", str(self.target_ess), remedy)
         target, inputs = build_target(model, data)
         job = Job(self, target, inputs, key, options)
         swarm, history = iterate(job, self._steps(target, inputs, key))

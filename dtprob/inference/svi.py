@@ -32,6 +32,7 @@ from dtprob.inference.engine import (
     RunOptions,
     check_choice,
     check_counts,
+    check_initial,
     check_key,
 )
 from dtprob.inference.guide import (
@@ -120,13 +121,17 @@ class SVI(AbstractEngine):
     starts: int = 4
     initial: Mapping[str, Any] | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        least = ("draws", "rank", "steps", "falls", "particles", "starts")
+        check_counts(self, dict.fromkeys(least, 1))
+        check_choice(self, "guide", ("auto", *get_args(Family.__value__)))
+        check_initial(self.initial)
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        least = ("draws", "rank", "steps", "falls", "particles", "starts")
-        check_counts(self, dict.fromkeys(least, 1))
-        check_choice(self, "guide", ("auto", *get_args(Family.__value__)))
         draw_key = jax.random.fold_in(check_key(key), 2)
         target, inputs = build_target(model, data)
         family = self._family(target)

@@ -29,6 +29,7 @@ from dtprob.inference.engine import (
     RunOptions,
     Serves,
     check_counts,
+    check_initial,
     check_key,
 )
 from dtprob.inference.iterate import Job, Steps, iterate
@@ -147,11 +148,15 @@ class VonMisesEM(AbstractEngine):
     initial: Mapping[str, Any] | None = None
     e_step: EStep = "exact"
 
+    def __post_init__(self) -> None:
+        """Refuse settings that cannot work."""
+        check_counts(self, {"draws": 1, "max_iterations": 1, "newton_steps": 1, "spread_starts": 0})
+        check_initial(self.initial)
+
     def __call__(
         self, key: jax.Array, model: Model, data: Mapping[str, Any], *, options: RunOptions = DEFAULT
     ) -> Posterior:
         """Infer; see `AbstractEngine`."""
-        check_counts(self, {"draws": 1, "max_iterations": 1, "newton_steps": 1, "spread_starts": 0})
         layout_key, draw_key = jax.random.split(check_key(key))
         target, inputs = build_target(model, data)
         if not target.angles.size:

@@ -312,9 +312,65 @@ def test_a_checkpoint_of_another_run_is_not_gone_on_with(case, capsys, tmp_path)
     out.mkdir()
     (out / "posterior.checkpoint").write_text("of something else")
     (out / "posterior.begun").write_text("something else")
-    assert main(["fit", str(case), "--out", str(out), "--resume"]) == 0
-    assert "beginning anew" in capsys.readouterr().out
+    words = ["fit", str(case), "--out", str(out)]
+    assert main([*words, "--resume"]) == 2
+    assert "expected a run of the same case by the same state of dtprob, got another" in capsys.readouterr().err
+    assert (out / "posterior.checkpoint").read_text() == "of something else"
+    assert main(words) == 0
     assert {entry.name for entry in out.iterdir()} == {"posterior.nc", "posterior.identity", "summary.json"}
+
+
+def test_a_setting_that_cannot_work_costs_no_earlier_result(case, capsys, tmp_path):
+    out = tmp_path / "out"
+    words = ["fit", str(case), "--out", str(out)]
+    assert main(words) == 0
+    before = {file.name: file.read_bytes() for file in out.iterdir()}
+    for setting, said in (("draws = 0", "draws of engine laplace"), ('initial = "zzz"', "initial values")):
+        text = case.read_text()
+        change(case, 'name = "laplace"', f'name = "laplace"\n[engine.options]\n{setting}')
+        assert main(words) == 2
+        assert said in capsys.readouterr().err
+        case.write_text(text)
+    assert {file.name: file.read_bytes() for file in out.iterdir()} == before
+
+
+@pytest.mark.parametrize(
+    ("command", "key", "name"),
+    [("fit", "file", "posterior.nc"), ("diagnose", "reference", "reference.nc"), ("diagnose", "file", "gap.nc")],
+)
+def test_no_result_takes_the_place_of_an_input(case, capsys, tmp_path, command, key, name):
+    (tmp_path / name).write_text("the user's own")
+    line = f'file = "{name}"' if key == "file" else f'file = "line.csv"\n{key} = "{name}"'
+    change(case, 'file = "line.csv"', line)
+    assert main([command, str(case), "--out", str(tmp_path)]) == 2
+    assert f"got {name}, which is read" in capsys.readouterr().err
+    assert (tmp_path / name).read_text() == "the user's own"
+
+
+def test_a_twin_takes_no_log_away(capsys, tmp_path):
+    (tmp_path / "log.csv").write_text("slots")
+    lines = Path(EXAMPLE).read_text().splitlines()
+    begin = next(k for k, line in enumerate(lines) if line.startswith("[physical.options]"))
+    end = next(k for k in range(begin + 1, len(lines)) if lines[k].startswith("["))
+    text = "\n".join(lines[:begin] + lines[end:])
+    changed = re.sub(r'environment = "multi_access".*', 'log = "log.csv"', text)
+    (tmp_path / "twin.toml").write_text(changed)
+    assert main(["twin", "run", str(tmp_path / "twin.toml"), "--out", str(tmp_path)]) == 2
+    assert "got log.csv, which is read" in capsys.readouterr().err
+    assert (tmp_path / "log.csv").read_text() == "slots"
+
+
+def test_a_demo_overwrites_nothing(capsys, tmp_path):
+    (tmp_path / "case").mkdir()
+    (tmp_path / "case" / "case.toml").write_text("# mine")
+    assert main(["demo", "--out", str(tmp_path)]) == 2
+    assert "got another file" in capsys.readouterr().err
+    assert {file.name for file in (tmp_path / "case").iterdir()} == {"case.toml"}
+
+
+def test_out_that_cannot_be_written_to_is_said_before_any_work(case, capsys):
+    assert main(["diagnose", str(case), "--out", "/proc"]) == 2
+    assert "expected a folder that can be written to" in capsys.readouterr().err
 
 
 @pytest.mark.study
@@ -324,12 +380,12 @@ def test_a_run_that_ends_before_its_first_checkpoint_leaves_no_other_ones(case, 
     (out / "posterior.checkpoint").write_text("of something else")
     (out / "posterior.begun").write_text("something else")
     change(case, 'name = "laplace"', 'name = "svi"\n[engine.options]\nsteps = 20\ndraws = 20')
-    words = ["fit", str(case), "--out", str(out), "--resume"]
+    words = ["fit", str(case), "--out", str(out)]
     with monkeypatch.context() as broken:
         broken.setattr(SVI, "__call__", lambda *_, **__: sys.exit(3))
         with pytest.raises(SystemExit):
             main(words)
-    assert main(words) == 0
+    assert main([*words, "--resume"]) == 0
 
 
 def test_a_failed_run_leaves_no_results_of_an_earlier_one(case, tmp_path):

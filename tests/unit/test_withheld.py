@@ -56,6 +56,38 @@ def answered(cases):
     return cases
 
 
+def test_answers_lie_apart_from_the_cases(cases, capsys):
+    assert main(["withheld", "run", str(cases / "cases"), "--out", str(cases / "cases")]) == 2
+    assert "expected a folder apart from the cases" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("records", "said"),
+    [
+        ([1, 2], "each with name, kind, lambda and effects"),
+        (None, "each with name, kind, lambda and effects"),
+        ([{"name": "0", "kind": "listed", "lambda": None, "effects": [{"name": "bias"}]}], "a number, got None"),
+        ([{"name": "0", "kind": "listed", "effects": [{"name": "bias"}]}], "none of 'lambda'"),
+        ([{"name": "0", "kind": "listed", "lambda": 1.0, "effects": []}], "expected its effects, got 0"),
+        ([{"name": "0", "kind": "listed", "lambda": 1.0, "effects": [{"name": ["bias"]}]}], "expected names"),
+        ([{"name": "0", "kind": "null", "lambda": 0.0, "effects": []}] * 2, "got two of 0"),
+    ],
+)
+def test_a_key_written_by_hand_is_checked(tmp_path, capsys, records, said):
+    (tmp_path / "key.json").write_text(json.dumps({"cases": records}))
+    assert main(["withheld", "score", str(tmp_path), "--key", str(tmp_path / "key.json")]) == 2
+    assert said in capsys.readouterr().err
+
+
+def test_a_report_that_lacks_something_is_told(tmp_path, capsys):
+    (tmp_path / "0").mkdir()
+    (tmp_path / "0" / "report.json").write_text('{"verdict": "NO_GAP"}')
+    key = {"cases": [{"name": "0", "kind": "null", "lambda": 0.0, "effects": []}]}
+    (tmp_path / "key.json").write_text(json.dumps(key))
+    assert main(["withheld", "score", str(tmp_path), "--key", str(tmp_path / "key.json")]) == 2
+    assert "answer 0: expected a report with its causes" in capsys.readouterr().err
+
+
 def test_answers_are_reports(answered):
     verdicts = {}
     for name in ("0000", "0001"):

@@ -72,9 +72,9 @@ def score(
     Raises:
         InputError: the key is none, no case has an answer, or one is of other data than the key's.
     """
-    truths, track = _truths(key), str(key.get("track"))
+    truths, track = check_key(key), str(key.get("track"))
     for name, report in reports.items():
-        _check_data(name, truths.get(name, {}), report or {})
+        _check_report(name, truths.get(name, {}), report)
     answers = {
         name: Answer(track, truth, reports[name], seconds.get(name))
         for name, truth in truths.items()
@@ -112,21 +112,47 @@ def score(
     }
 
 
-def _truths(key: Mapping[str, Any]) -> dict[str, Truth]:
+def check_key(key: Mapping[str, Any]) -> dict[str, Truth]:
+    """The record of each case by its name.
+
+    Args:
+        key: content of key.json.
+
+    Raises:
+        InputError: a record that lacks something, or two of one name.
+    """
+    truths: dict[str, Truth] = {}
     try:
-        truths = {str(case["name"]): case for case in key["cases"]}
-        for name, truth in truths.items():
-            _ = [effect["name"] for effect in truth["effects"]]
-            if truth["kind"] not in _KINDS:
-                raise unknown_name(f"kind of case {name} in the key", str(truth["kind"]), _KINDS, "kind")
+        for case in key["cases"]:
+            name, kind = str(case["name"]), str(case["kind"])
+            if kind not in _KINDS:
+                raise unknown_name(f"kind of case {name} in the key", kind, _KINDS, "kind")
+            if name in truths:
+                raise InputError("key", "one record of each case", f"two of {name}", "Leave one of them out")
+            if not all(isinstance(effect["name"], str) for effect in case["effects"]):
+                raise InputError(f"effects of case {name} in the key", "names", "others", "Correct them")
+            if (kind == "null") == bool(case["effects"]):
+                expected = "no effects" if kind == "null" else "its effects"
+                raise InputError(
+                    f"case {name} in the key, {kind}", expected, f"{len(case['effects'])}", "Correct it"
+                )
+            if kind != "null" and not isinstance(case["lambda"], int | float):
+                got = repr(case["lambda"])
+                raise InputError(f"lambda of case {name} in the key", "a number", got, "Correct it")
+            truths[name] = case
     except (KeyError, TypeError) as error:
         expected = "`cases`, each with name, kind, lambda and effects"
         raise InputError("key", expected, f"none of {error}", "Give the key.json of these cases") from error
     return truths
 
 
-def _check_data(name: str, truth: Truth, report: Report) -> None:
+def _check_report(name: str, truth: Truth, report: Report | None) -> None:
     """Answers of another study have the same names of cases: where both tell hashes of the data, these tell."""
+    if report is None:
+        return
+    for part in ("verdict", "causes"):
+        if part not in report:
+            raise InputError(f"answer {name}", f"a report with its {part}", "none", "Answer the case again")
     made_of = report.get("provenance", {}).get("data_sha256")
     known = truth.get("sha256")
     if made_of and known and made_of not in known.values():

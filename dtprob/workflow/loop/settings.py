@@ -94,6 +94,12 @@ class TwinCase:
     seed: SeedSection = field(default_factory=SeedSection)
 
     @property
+    def files(self) -> tuple[Path, ...]:
+        """The files that this case reads, besides the user's own modules."""
+        log = self.physical.log
+        return (self.path,) if log is None else (self.path, self.path.parent / log)
+
+    @property
     def user_code(self) -> tuple[str, ...]:
         """The user's own functions that this case runs."""
         name = self.physical.environment
