@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from itertools import product
 from typing import Any, Final
@@ -108,7 +109,9 @@ def _crossings(paths: PathSet, start: np.ndarray, stop: np.ndarray) -> jax.Array
 
 
 def _name(start: np.ndarray, stop: np.ndarray) -> str:
-    ends = [f"{round(float(v), 1) + 0.0:g}" for v in (*start, *stop)]
+    """The ends in m, with as many digits as tell this screen from the next one."""
+    digits = max(1, math.ceil(-math.log10(float(np.abs(stop - start).max()))) + 1)
+    ends = [f"{round(float(v), digits) + 0.0:g}" for v in (*start, *stop)]
     return f"{ends[0]}_{ends[1]}_to_{ends[2]}_{ends[3]}"
 
 

@@ -26,6 +26,7 @@ from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View
+from dtprob.gap.where.data_columns import check_finite
 from dtprob.gap.where.read_twice import read_twice
 from dtprob.gap.where.site_finding import likely_left, most_left
 from dtprob.gap.which.classes import credible
@@ -79,21 +80,21 @@ def diagnose(
         say: receives one line at each stage, for progress.
 
     Raises:
-        InputError: effects on absent sites, effects that change the model at their null, fewer than four
-            clusters, as many unknowns that clusters share as there are data, indices in data beyond an array's end,
-            observed values that their distribution cannot take or that are impossible under the base model, a base model
-            that does not fit, or one that meets the data exactly.
+        InputError: effects on absent sites, effects that change the model at their null, fewer than four clusters, as many
+            unknowns that clusters share as there are data, indices in data beyond an array's end, columns with missing
+            values, observed values that their distribution cannot take or that are impossible under the base model, a base
+            model that does not fit, or one that meets the data exactly.
     """
     engine = resolve(engine) if isinstance(engine, str) else engine
     model = taking(model, data, cluster)
     check_indices(model, data)
     check_support(model, data)
     problem = Problem(model, data, effects, cluster, reference)
-    if problem.n_cluster < 4:
+    if (told := int((problem.n_observation_of_each > 0).sum())) < 4:
         raise InputError(
             "clusters",
             "at least 4 independent ones",
-            f"{problem.n_cluster} along {problem.cluster_name!r}",
+            f"{told} along {problem.cluster_name!r}",
             "Give more links, episodes or segments, or another cluster axis.",
         )
     shared = len(held(problem))
@@ -105,6 +106,7 @@ def diagnose(
             "Leave some out, or choose a cluster that has entries of its own.",
         )
     check_nulls(problem)
+    check_finite(problem)
     evidence = _gather(problem, key, settings, say)
     causes = _causes(evidence, jax.random.fold_in(key, 7), engine, settings, say)
     verdict = decide(evidence, causes, settings)
@@ -180,12 +182,15 @@ def _causes(
     estimates = evidence.held_after.estimates[first.site_name(first.parameters[0].name)]
     strata = tuple(float(v) for v in estimates[:, 0])
     physics = " ".join(e.physics for e in effects if e.physics)
+    held, but_for_fields = (evidence.held_before, evidence.held_after), evidence.floor.of_known_fields
     cause = Cause(
         effects=evidence.accepted,
         alias_class=classes,
         probability=probability,
         size=sizes,
         closed_fraction=evidence.fraction,
+        explained=None if evidence.fraction is None else closed.share(*held, but_for_fields, key),
+        parameters=evidence.floor.parameters,
         shares=evidence.shares,
         physics=physics,
         strata=strata,
@@ -210,15 +215,16 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
         return "UNLISTED" if evidence.before.site_p_value <= level else "UNDETERMINED"
     cause = causes[0]
     remains = evidence.after.site_p_value <= level
-    if cause.closed_fraction is None:
+    explained = cause.explained
+    if explained is None:
         return "UNLISTED" if remains else "UNDETERMINED"
-    is_poor = cause.closed_fraction.mean < _relevance(evidence, settings)
-    is_poor = is_poor and not (cause.closed_fraction.low >= _SOME and _leaves_moments(evidence, level))
+    is_poor = explained.mean < _relevance(evidence, settings)
+    is_poor = is_poor and not (explained.low >= _SOME and _leaves_moments(evidence, level))
     is_too_large = not cause.plausible and _are_fields(evidence)
     if remains and (is_poor or is_too_large or _hides(evidence, level)):
         return "UNLISTED"
     is_left = remains or bool(evidence.asked_for)
-    leaves = is_left and (cause.closed_fraction.mean < 1 - settings.minor or _are_fields(evidence))
+    leaves = is_left and (explained.mean < 1 - settings.minor or _are_fields(evidence))
     if cause.probability < settings.credibility:
         # equally good sets that all leave something are imitations
         return "UNLISTED" if leaves and remains else "UNDETERMINED"

@@ -35,6 +35,8 @@ class Cause:
         probability: among the sets that were refitted.
         size: posterior of each scalar parameter.
         closed_fraction: on held-out clusters; None where not established.
+        explained: the same if the entries of random fields were known: having to estimate them is nothing against a cause.
+        parameters: how many were estimated, with the entries of random fields that clusters share.
         shares: how much of that each effect closes, where there are several.
         physics: one line.
         strata: the first size's estimate in the fit without each fold.
@@ -46,6 +48,8 @@ class Cause:
     probability: float
     size: tuple[Size, ...]
     closed_fraction: ClosedFraction | None
+    explained: ClosedFraction | None
+    parameters: float
     shares: tuple[Share, ...]
     physics: str
     strata: tuple[float, ...]
@@ -94,6 +98,7 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "closed_fraction": None
         if closed is None
         else {"mean": closed.mean, "low": closed.low, "high": closed.high},
+        "parameters": cause.parameters,
         "shares": [asdict(share) for share in cause.shares],
         "physics": cause.physics,
         "strata": {"estimate": list(cause.strata)},

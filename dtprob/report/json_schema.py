@@ -74,6 +74,7 @@ class Cause(TypedDict):
     probability: Probability
     size: dict[str, Size]
     closed_fraction: Interval | None
+    parameters: NotRequired[Number]
     shares: NotRequired[list[Share]]
     physics: NotRequired[str]
     strata: NotRequired[Strata]

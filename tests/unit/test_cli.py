@@ -314,7 +314,9 @@ def test_a_checkpoint_of_another_run_is_not_gone_on_with(case, capsys, tmp_path)
     (out / "posterior.begun").write_text("something else")
     words = ["fit", str(case), "--out", str(out)]
     assert main([*words, "--resume"]) == 2
-    assert "expected a run of the same case by the same state of dtprob, got another" in capsys.readouterr().err
+    assert (
+        "expected a run of the same case by the same state of dtprob, got another" in capsys.readouterr().err
+    )
     assert (out / "posterior.checkpoint").read_text() == "of something else"
     assert main(words) == 0
     assert {entry.name for entry in out.iterdir()} == {"posterior.nc", "posterior.identity", "summary.json"}
@@ -335,16 +337,19 @@ def test_a_setting_that_cannot_work_costs_no_earlier_result(case, capsys, tmp_pa
 
 
 @pytest.mark.parametrize(
-    ("command", "key", "name"),
-    [("fit", "file", "posterior.nc"), ("diagnose", "reference", "reference.nc"), ("diagnose", "file", "gap.nc")],
+    ("command", "line", "name"),
+    [
+        ("fit", 'file = "posterior.nc"', "posterior.nc"),
+        ("diagnose", 'file = "line.csv"\nreference = "reference.nc"', "reference.nc"),
+        ("diagnose", 'file = "gap.nc"', "gap.nc"),
+    ],
 )
-def test_no_result_takes_the_place_of_an_input(case, capsys, tmp_path, command, key, name):
-    (tmp_path / name).write_text("the user's own")
-    line = f'file = "{name}"' if key == "file" else f'file = "line.csv"\n{key} = "{name}"'
+def test_no_result_takes_the_place_of_an_input(case, capsys, command, line, name):
+    (case.parent / name).write_text("the user's own")
     change(case, 'file = "line.csv"', line)
-    assert main([command, str(case), "--out", str(tmp_path)]) == 2
+    assert main([command, str(case), "--out", str(case.parent)]) == 2
     assert f"got {name}, which is read" in capsys.readouterr().err
-    assert (tmp_path / name).read_text() == "the user's own"
+    assert (case.parent / name).read_text() == "the user's own"
 
 
 def test_a_twin_takes_no_log_away(capsys, tmp_path):

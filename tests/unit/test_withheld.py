@@ -66,7 +66,10 @@ def test_answers_lie_apart_from_the_cases(cases, capsys):
     [
         ([1, 2], "each with name, kind, lambda and effects"),
         (None, "each with name, kind, lambda and effects"),
-        ([{"name": "0", "kind": "listed", "lambda": None, "effects": [{"name": "bias"}]}], "a number, got None"),
+        (
+            [{"name": "0", "kind": "listed", "lambda": None, "effects": [{"name": "bias"}]}],
+            "a number, got None",
+        ),
         ([{"name": "0", "kind": "listed", "effects": [{"name": "bias"}]}], "none of 'lambda'"),
         ([{"name": "0", "kind": "listed", "lambda": 1.0, "effects": []}], "expected its effects, got 0"),
         ([{"name": "0", "kind": "listed", "lambda": 1.0, "effects": [{"name": ["bias"]}]}], "expected names"),

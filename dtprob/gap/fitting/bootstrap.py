@@ -134,11 +134,12 @@ def more(drawn: Replicates, times: int) -> Replicates:
 def normal_like(drawn: Replicates) -> tuple[np.ndarray, dict[str, np.ndarray]]:
     """Normal projected rows (replicate, cluster, row) of the replicates' covariance, as many as these, and site gradients.
 
-    Rare outcomes may be seen by no replicate; in these they have their share.
+    Rare outcomes may be seen by no replicate; in these they have their share. What does not count has none.
     """
     of_noise, of_prior = jax.random.split(jax.random.fold_in(drawn.keys[0], 1))
     keys = jax.random.split(of_prior, drawn.at_sites)
-    rows = np.asarray(jax.random.normal(of_noise, (drawn.at_sites, *drawn.raw.shape)))
+    counts = drawn.problem.rows.of_entries(drawn.problem.observed.counted) > 0
+    rows = counts * np.asarray(jax.random.normal(of_noise, (drawn.at_sites, *drawn.raw.shape)))
     projected = drawn.projection.rows(drawn.projection.with_prior(rows, keys))
     found = drawn.site_gradients(np.concatenate([drawn.rows[:1], projected]))
     return projected, {name: np.asarray(g)[1:] for name, g in found.items()}

@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 from jaxtyping import Float
+from scipy import special
 
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.density import system_at
@@ -16,6 +17,8 @@ from dtprob.gap.model.problem import Problem
 
 _FEWEST: Final = 0.5
 """Entries that count as determined at least."""
+_TAILS: Final = np.array([0.05, 0.95])
+"""Probabilities above the quantiles that bound a 90% interval."""
 
 
 def shared_weights(problem: Problem, fitted: Fit, name: str) -> float:
@@ -25,19 +28,21 @@ def shared_weights(problem: Problem, fitted: Fit, name: str) -> float:
     return float(np.trace(_determined(problem, fitted, name)[0]))
 
 
-def deviation_of_spread(problem: Problem, fitted: Fit, name: str) -> float:
-    """Standard deviation of the estimate of a field's standard deviation s: s / sqrt(2 sum gamma^2).
+def interval_of_spread(problem: Problem, fitted: Fit, name: str) -> tuple[float, float]:
+    """90% interval of a field's standard deviation s: nu s^2 over its square is chi-square of nu = sum gamma^2 degrees.
 
     The Fisher information of log s in normal data, whose directions have variances s^2 + 1 / J, is 2 sum gamma^2, with
-    gamma = 1 - var / s^2 the share of each direction that the data determine (MacKay, Neural Computation 4 (1992) 415).
+    gamma = 1 - var / s^2 the share of each direction that the data determine (MacKay, Neural Computation 4 (1992) 415): as
+    much as that many entries tell that are known exactly.
 
     Args:
         problem: in which the field is live.
         fitted: the fit that has it.
         name: of its effect.
     """
-    total = float(np.sum(_determined(problem, fitted, name) ** 2))
-    return fitted.spread[name] / float(np.sqrt(2 * max(total, _FEWEST)))
+    total = max(float(np.sum(_determined(problem, fitted, name) ** 2)), _FEWEST)
+    low, high = np.sqrt(total / special.chdtri(total, _TAILS))
+    return fitted.spread[name] * float(low), fitted.spread[name] * float(high)
 
 
 def _determined(problem: Problem, fitted: Fit, name: str) -> Float[np.ndarray, "part entry entry"]:

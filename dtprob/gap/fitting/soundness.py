@@ -15,6 +15,7 @@ from dtprob.gap.fitting.at_end import at_end
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import project
 from dtprob.gap.fitting.states import are_states
+from dtprob.gap.model.inline import unnamed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
 from dtprob.models.declaration import base_constraint
@@ -148,7 +149,17 @@ def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
         )
     found += [f"{name} is at the end of its prior" for name in at_end(problem, fitted)]
     found += _contradicted(problem, fitted)
+    found += _inline(problem, fitted)
     return (*found, *_too_large(problem, fitted), *_misfit(problem, fitted), *_undetermined(problem, fitted))
+
+
+def _inline(problem: Problem, fitted: Fit) -> list[str]:
+    """Observations for whose values no site stands, though the model names some."""
+    names = sorted(unnamed(problem, fitted.x)) if problem.float_sites else []
+    remedy = "where one is named, let the model go on with what numpyro.deterministic returns"
+    return (
+        [f"no site that the model names stands for the values of {_listed(names)}: {remedy}"] if names else []
+    )
 
 
 def _contradicted(problem: Problem, fitted: Fit) -> list[str]:

@@ -85,7 +85,8 @@ def _led(
 ) -> list[np.ndarray]:
     """Where fits to counted readings lead."""
     model = within(problem.model, lambda: _OnALine(names))
-    line = Problem(model, {**problem.data, **counted}, problem.effects, problem.cluster_name)
+    cluster = problem.column or problem.declaration.cluster
+    line = Problem(model, {**problem.data, **counted}, problem.effects, cluster)
     start = line.translate(x, problem)
     found = [fitting.fit(line, start, steps=_STEPS).x]
     if states(line).blocks or activate(line).local_index.shape[1]:

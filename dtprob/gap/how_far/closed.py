@@ -14,10 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
-from scipy import special
+from scipy import special, stats
 
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
+from dtprob.gap.fitting.determined import shared_weights
 from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.refit import at_null_except
 from dtprob.gap.how_far.earlier import on_earlier_data
@@ -164,14 +165,22 @@ class Floor:
 
     Attributes:
         low, high: bracket of what the causes, with their parameters as they are fitted, and whatever is left could reach.
-        parameters: d of the causes.
+        parameters: d of the causes, with the entries of random fields that clusters share, as far as the data tell them.
         estimation: what not knowing them costs on average, see `cost`; half a chi-square of d degrees, scaled alike.
+        but_for_fields: both without the entries of fields.
     """
 
     low: float
     high: float
     parameters: float = 0.0
     estimation: float = 0.0
+    but_for_fields: tuple[float, float] = (0.0, 0.0)
+
+    @property
+    def of_known_fields(self) -> Floor:
+        """The same if the entries of random fields were known."""
+        parameters, estimation = self.but_for_fields
+        return replace(self, parameters=parameters, estimation=estimation)
 
     @property
     def best(self) -> float:
@@ -204,9 +213,12 @@ def floor(problem: Problem, full: fitting.Fit, after: HeldOut, remaining_gain: f
         remaining_gain: nats that moving any one site freely would still gain, as far as it is likely that one is wrong.
         n_folds: K.
     """
-    size = sum(e.dimension for e in problem.effects if e.name in full.effects)
+    effects = [e for e in problem.effects if e.name in full.effects]
+    size = sum(e.dimension for e in effects)
+    entries = sum(shared_weights(problem, full, e.name) for e in effects if e.kind == "variance")
     reached = float(after.log_likelihood.sum())
-    return Floor(reached, reached + max(remaining_gain, 0.0), size, cost(size, n_folds))
+    estimation, known = cost(size + entries, n_folds), cost(size, n_folds)
+    return Floor(reached, reached + max(remaining_gain, 0.0), size + entries, estimation, (size, known))
 
 
 def shown(best: Floor, after: HeldOut, beyond: HeldOut) -> Floor:
@@ -266,13 +278,17 @@ def _fraction(gain: ArrayLike, rest: ArrayLike) -> np.ndarray:
 def _gains(before: HeldOut, after: HeldOut, key: jax.Array, draws: int) -> tuple[np.ndarray, np.ndarray]:
     """Gain of each cluster, and its totals over bootstrap draws of the clusters and of what earlier data say by chance.
 
-    The gain g of clusters that tell alone of an effect is a log likelihood ratio, of variance 2 g.
+    The gain g of clusters that tell alone of an effect is a log likelihood ratio, of variance 2 g. The draws stray too
+    little from the total by the degree of freedom that its mean takes, and a few clusters have the tails of Student's t.
     """
     gain = after.log_likelihood - before.log_likelihood
     own = gain[after.alone].sum()
     chance = np.asarray(jax.random.normal(jax.random.fold_in(key, 2), (draws,)))
     variance = max(before.doubt - after.doubt, 0.0) + 2 * max(own, 0.0)
-    return gain, gain[resampled(len(gain), after.alone, key, draws)].sum(1) + np.sqrt(variance) * chance
+    total, free = gain.sum(), max(len(gain) - len(after.alone) - 1, 1)
+    stretch = np.sqrt((free + 1) / free) * stats.t.ppf(0.95, free) / stats.norm.ppf(0.95)
+    drawn = gain[resampled(len(gain), after.alone, key, draws)].sum(1)
+    return gain, total + stretch * (drawn - total) + np.sqrt(variance) * chance
 
 
 def resampled(

@@ -14,6 +14,7 @@ from numpyro.distributions import biject_to, constraints
 from numpyro.distributions.transforms import IdentityTransform
 
 from dtprob.effects.effect import Effect
+from dtprob.errors import InputError
 from dtprob.gap.model.own import Own
 from dtprob.models.declaration import base_constraint
 
@@ -130,18 +131,35 @@ def fold(jacobian: jax.Array, fn: Any, value: jax.Array) -> jax.Array:
     return jnp.sum(jacobian, axis=tuple(range(-extra, 0))) if extra > 0 else jacobian
 
 
+_DRAWS_OF_EACH: Final = 2
+"""Different draws of each entry that a covariance takes at least."""
 type Known = dict[tuple[str, ...], tuple[np.ndarray, np.ndarray]]
 """Mean and precision of sites together, each flattened, by their names."""
 
 
 def normal_of(draws: Mapping[str, np.ndarray]) -> Known:
-    """Normal approximation of draws (draw, size) of sites; those that go together, as slope and intercept do, are one."""
+    """Normal approximation of draws (draw, size) of sites; those that go together, as slope and intercept do, are one.
+
+    The inverse of a covariance that is told by n draws of d entries is too large by (n - 1) / (n - d - 2), as an inverse
+    Wishart is (Hartlap, Simon and Schneider, Astron. Astrophys. 464 (2007) 399), unless they are all the same.
+
+    Raises:
+        InputError: fewer different draws than tell the covariance of so many entries.
+    """
     result: Known = {}
     for names in _groups(draws):
-        u = np.concatenate([draws[name] for name in names], axis=1)
+        u = np.unique(
+            np.concatenate([draws[name] for name in names], axis=1), axis=0
+        )  # a sampler may repeat itself
+        n, d = u.shape
+        if 1 < n < _DRAWS_OF_EACH * d:
+            expected = f"{_DRAWS_OF_EACH * d} different draws or more, for {d} unknowns that hang together"
+            raise InputError(f"reference, {', '.join(names)}", expected, str(n), "Let its engine draw more")
         size = np.mean(u**2, axis=0)
         floor = 1e-10 * np.where(size > 0, size, 1.0)  # in the unit of each entry
-        result[names] = (u.mean(0), np.linalg.inv(np.atleast_2d(np.cov(u.T)) + np.diag(floor)))
+        covariance = np.cov(u.T).reshape(d, d) if n > 1 else np.zeros((d, d))
+        share = (n - d - 2) / (n - 1) if n > d + 2 else 1.0
+        result[names] = (u.mean(0), share * np.linalg.inv(covariance + np.diag(floor)))
     return result
 
 

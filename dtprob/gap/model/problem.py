@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from copy import copy
 from functools import cached_property
-from typing import Any, final
+from typing import Any, Final, final
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,9 @@ from dtprob.models.arguments import Data, Model, as_arrays, split_static, within
 from dtprob.models.declaration import Declaration, declare
 from dtprob.models.supported import check_supported
 
+_OF_EACH: Final = 10
+"""Draws of a reference for each of its unknowns, if it has as many."""
+
 
 @final
 class Problem:
@@ -54,6 +57,7 @@ class Problem:
         effects: all candidates.
         cluster: axis or data column whose values are independent of one another.
         reference: draws of the nuisances from earlier data; their normal approximation replaces the prior.
+        decentre: whether levels may be drawn in units of their spread, where no reference tells them.
 
     Raises:
         InputError: the data do not fit the model, an effect names no site of the model, or the cluster is unknown.
@@ -66,6 +70,8 @@ class Problem:
         effects: Sequence[Effect],
         cluster: str | None = None,
         reference: Sampler | None = None,
+        *,
+        decentre: bool = True,
     ) -> None:
         data = as_arrays(data)
         self.data, self.effects = data, tuple(effects)
@@ -88,7 +94,7 @@ class Problem:
         self.volume: Volume | None = None
         self._find_own()
         shared = self.declaration.latent.keys() - self.own.keys()
-        drawn = model if reference is not None else decentred(model, data, shared, self.own)
+        drawn = model if reference is not None or not decentre else decentred(model, data, shared, self.own)
         latent = set(self.declaration.latent)
         if drawn is not model:
             self._declare(drawn, static)
@@ -97,7 +103,8 @@ class Problem:
         self.own |= own.of_fields(self) if self.column else {}
         if reference is not None:
             shared = [b.name for b in self.blocks_of(None) if not b.local]
-            draws = self._prior.reference_draws(reference, shared, DRAWS, self.arrays)
+            count = max(DRAWS, _OF_EACH * sum(self.layout[name].size for name in shared))
+            draws = self._prior.reference_draws(reference, shared, count, self.arrays)
             self.known = normal_of(draws)
             self._lay_out()
 

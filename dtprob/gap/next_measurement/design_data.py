@@ -119,7 +119,7 @@ def designs_of(there: Problem, here: Problem, fits: Sequence[Fit], name: str) ->
     moved = [replace(fitted, x=there.translate(fitted.x, here)) for fitted in fits]
     origin = there.compiled.observations(moved[0].x)
     columns = [_columns(there, fitted) for fitted in moved]
-    _check_parameters(there, fits, name)
+    _check_parameters(there, here, fits, name)
     whitened = _whitening(there, moved[0].x, columns[0].own)
     rivals = [
         (
@@ -146,7 +146,8 @@ def _problem_at(here: Problem, data: Data) -> Problem:
         axis for site in here.declaration.observed.values() for axis in site.axes
     }
     data = _with_values(here, data)
-    there = Problem(here.model, data, here.effects, here.cluster_name if named else None)
+    there = Problem(here.model, data, here.effects, here.cluster_name if named else None, decentre=False)
+    there.known = here.known
     return there.with_live([effect.name for effect in here.live])
 
 
@@ -161,14 +162,17 @@ def _with_values(here: Problem, data: Data) -> Data:
     return {**given, **{argument: trace[name]["value"] for name, argument in missing.items()}}
 
 
-def _check_parameters(there: Problem, fits: Sequence[Fit], name: str) -> None:
+def _check_parameters(there: Problem, here: Problem, fits: Sequence[Fit], name: str) -> None:
     """Designs must have the parameters that were fitted."""
     for fitted in fits:
-        count = len(activate(there, fitted.effects).global_index)
-        if count != len(fitted.covariance):
-            expected = f"the {len(fitted.covariance)} shared parameters of the fit"
+        own, expected = (
+            {b.name: b.size for b in activate(problem, fitted.effects).blocks if not b.local}
+            for problem in (there, here)
+        )
+        if own != expected:
+            fitted_ones = f"the {sum(expected.values())} shared parameters of the fit"
             remedy = "Give designs of the same objects, antennas and devices"
-            raise InputError(f"design {name}", expected, str(count), remedy)
+            raise InputError(f"design {name}", fitted_ones, str(sum(own.values())), remedy)
 
 
 def _label(problem: Problem, cluster: int) -> Any:

@@ -8,6 +8,7 @@ from typing import Final
 import equinox as eqx
 import numpy as np
 
+from dtprob.errors import InputError
 from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import Site
 
@@ -16,12 +17,36 @@ _MOST: Final = 32
 """Columns of positions, and of tables of features, up to which each is looked along; wider ones are neither."""
 
 
-def columns(problem: Problem, axis: str, size: int) -> dict[str, np.ndarray]:
-    """Columns of the data (size,) that lie along an axis of the observations and vary; of positions or features each."""
+def check_finite(problem: Problem) -> None:
+    """Refuse columns with missing values beside readings that count: nothing could be looked for along them.
+
+    Raises:
+        InputError: the first such column.
+    """
+    for name, site in problem.declaration.observed.items():
+        counts = problem.observed.counted[name]
+        for column, missing in all_columns(problem, site, missing=True).items():
+            lost = counts & np.broadcast_to(missing, site.shape)
+            if lost.any():
+                first = ", ".join(str(int(k)) for k in np.argwhere(lost)[0])
+                got = f"{int(lost.sum())} that are not, the first at [{first}]"
+                remedy = "Fill them, leave those readings out, or give the model no such column"
+                raise InputError(f"data {column}", "finite numbers beside each reading", got, remedy)
+
+
+def columns(problem: Problem, axis: str, size: int, *, missing: bool = False) -> dict[str, np.ndarray]:
+    """Columns of the data (size,) that lie along an axis of the observations and vary; of positions or features each.
+
+    Args:
+        problem: the model on its data.
+        axis: the axis.
+        size: entries along it.
+        missing: tell where they are not finite, instead.
+    """
     if not any(axis in site.axes for site in problem.declaration.observed.values()):
         return {}
     found: dict[str, np.ndarray] = {}
-    for name, column in _given(problem):
+    for name, column in _given(problem, missing=missing):
         if column.shape == (size,):
             found[name] = column
         elif column.ndim == 2 and column.shape[0] == size and _is_table(problem, column.shape):
@@ -40,21 +65,21 @@ def _is_table(problem: Problem, shape: tuple[int, ...]) -> bool:
     return shape[1] <= _POSITION or (shape[1] <= _MOST and not whole)
 
 
-def whole_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
+def whole_columns(problem: Problem, site: Site, *, missing: bool = False) -> dict[str, np.ndarray]:
     """Columns of the data that lie on several axes of an observed site, with an entry for each observation."""
     return {
         name: np.broadcast_to(column, site.shape)
-        for name, column in _given(problem)
+        for name, column in _given(problem, missing=missing)
         if column.ndim > 1 and _is_within(column.shape, site.shape)
     }
 
 
-def all_columns(problem: Problem, site: Site) -> dict[str, np.ndarray]:
+def all_columns(problem: Problem, site: Site, *, missing: bool = False) -> dict[str, np.ndarray]:
     """Columns of the data on one axis or several of an observed site, of size 1 along the site's other axes."""
-    found = whole_columns(problem, site)
+    found = whole_columns(problem, site, missing=missing)
     for i, axis in enumerate(site.axes):
         beside = tuple(j for j in range(len(site.shape)) if j != i)
-        for name, column in columns(problem, axis, site.shape[i]).items():
+        for name, column in columns(problem, axis, site.shape[i], missing=missing).items():
             found.setdefault(name, np.expand_dims(column, beside))
     return found
 
@@ -67,8 +92,23 @@ def _is_within(shape: tuple[int, ...], wide: tuple[int, ...]) -> bool:
         return False
 
 
-def _given(problem: Problem) -> Iterator[tuple[str, np.ndarray]]:
-    """The arrays of the data, but for what tells what was observed."""
+def _given(problem: Problem, *, missing: bool) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of the data, but for what tells what was observed; or where they are not finite.
+
+    What is missing is as the others are on average: only beside readings that do not count may anything be.
+    """
     for name, values in problem.data.items():
         if name not in problem.observed.arguments and eqx.is_array_like(values):
-            yield name, np.asarray(values)
+            array = np.asarray(values)
+            lost = (
+                ~np.isfinite(array) if np.issubdtype(array.dtype, np.inexact) else np.zeros(array.shape, bool)
+            )
+            if missing:
+                yield name, lost
+            else:
+                yield (
+                    name,
+                    np.where(lost, array[~lost].mean() if not lost.all() else 0.0, array)
+                    if lost.any()
+                    else array,
+                )

@@ -144,16 +144,21 @@ def deterministic(name: str, axes: tuple[str, ...], value: np.ndarray, gradients
     return Site(name, axes, grown, gradients, kinds)
 
 
-def observed(problem: Problem, rows: np.ndarray) -> Iterator[Site]:
-    """Spreads of what is observed, from projected rows (n, cluster, row); locations too where the model names no site.
+def observed(problem: Problem, rows: np.ndarray, unnamed: Collection[str]) -> Iterator[Site]:
+    """Spreads of what is observed, and locations where no site stands for them.
 
     What rows of a mixture tell beside (where its parts lie, how often each comes) is its shape.
+
+    Args:
+        problem: the model on its data.
+        rows: projected ones (n, cluster, row).
+        unnamed: the observations whose locations are looked at; see `dtprob.gap.model.inline`.
     """
     for name, own in problem.rows.by_site(rows).items():
         site, count = problem.declaration.observed[name], own.shape[1]
         located = problem.located[name]
         complex_parts = 2 if likelihood(problem.families[name]).is_complex else 1
-        kinds = [("location", range(complex_parts))] if not problem.float_sites else []
+        kinds = [("location", range(complex_parts))] if name in unnamed else []
         kinds += [("spread", range(located, located + 1))] if located < count else []
         kinds += [("shape", range(row, row + 1)) for row in range(located + 1, count)]
         for kind, moved in kinds:

@@ -19,6 +19,7 @@ from dtprob.gap.fitting.bootstrap import Replicates, more, normal_like
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.model.conditioned import conditioned
+from dtprob.gap.model.inline import unnamed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
@@ -146,6 +147,7 @@ class _Ways(NamedTuple):
         values: of the sites.
         along: curves along their axes.
         over: curves over quantities.
+        unnamed: observations whose values no site stands for.
         normal: normal rows and site gradients, of the replicates' covariance, of outcomes and counts; else None.
         repeated: observations of which one value is read too often.
     """
@@ -153,6 +155,7 @@ class _Ways(NamedTuple):
     values: Mapping[str, np.ndarray]
     along: Along
     over: Over
+    unnamed: frozenset[str]
     normal: tuple[np.ndarray, Mapping[str, np.ndarray]] | None
     repeated: Sequence[SiteFinding]
 
@@ -171,7 +174,7 @@ def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
     ]
     discrete = any(is_discrete(family) for family in problem.families.values())
     normal = normal_like(drawn) if discrete else None
-    return _Ways(values, along, over, normal, tuple(repeats(problem, x)))
+    return _Ways(values, along, over, unnamed(problem, x), normal, tuple(repeats(problem, x)))
 
 
 def _test_sites(
@@ -183,7 +186,7 @@ def _test_sites(
         rows = np.concatenate([rows, ways.normal[0]])
         gradients = {n: np.concatenate([g, ways.normal[1][n]]) for n, g in gradients.items()}
     found = [deterministic(n, axes[n], ways.values[n], g) for n, g in gradients.items()]
-    found += observed(problem, rows)
+    found += observed(problem, rows, ways.unnamed)
 
     def test(family: Family, scores: np.ndarray) -> FamilyTest:
         own, normal = np.split(scores, [len(drawn.rows)])

@@ -43,7 +43,7 @@ def _copies(problem: Problem, name: str, site: Site) -> int:
     counted = problem.observed.counted[name]
     values = np.asarray(problem.observed.values[name])[counted]
     given = [np.broadcast_to(column, site.shape)[counted] for column in all_columns(problem, site).values()]
-    if not given:
+    if not given or not values.size:
         return 0
     _, circumstances = np.unique(np.stack(given, axis=1), axis=0, return_inverse=True)
     _, first, count = np.unique(

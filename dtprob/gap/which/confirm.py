@@ -16,7 +16,7 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.bounded import Bounded, bounded_draws
 from dtprob.gap.fitting.density import system_at
-from dtprob.gap.fitting.determined import deviation_of_spread
+from dtprob.gap.fitting.determined import interval_of_spread
 from dtprob.gap.fitting.informed import informed
 from dtprob.gap.fitting.plausible import limits, nulls, plausible_spread, scales
 from dtprob.gap.model.problem import Problem
@@ -142,12 +142,13 @@ def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) 
         if parameter.is_place:
             index = int(problem.layout[effect.site_name(parameter.name)].index[0, 0])
             middle = float(fitted.x[index])
-            deviation, lowest = float(np.sqrt(fitted.covariance[position[index], position[index]])), -np.inf
+            half = _Z90 * float(np.sqrt(fitted.covariance[position[index], position[index]]))
+            low, high = middle - half, middle + half
         else:
             middle = fitted.spread[effect.name]
-            deviation, lowest = deviation_of_spread(problem, fitted, effect.name), 0.0
-        half, name = _Z90 * deviation, f"{prefix}{parameter.name}{_suffix(parameter.unit)}"
-        found.append(Size(name, middle, max(middle - half, lowest), middle + half, parameter.unit))
+            low, high = interval_of_spread(problem, fitted, effect.name)
+        name = f"{prefix}{parameter.name}{_suffix(parameter.unit)}"
+        found.append(Size(name, middle, low, high, parameter.unit))
     return found
 
 

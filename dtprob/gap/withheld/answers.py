@@ -179,7 +179,7 @@ class Answer:
         total = sum(map(self.lambda_of, self.truth["effects"]))
         if not (self.is_right and closed and total > 0 and self.first):
             return []
-        folds, size = Settings().folds, len(self.first.get("size", {}))
+        folds, size = Settings().folds, float(self.first.get("parameters", len(self.first.get("size", {}))))
         return [closed["low"] <= 1 - size * folds / (folds - 1) / total <= closed["high"]]
 
     @cached_property

@@ -30,7 +30,7 @@ def evidence(kind, p_after, asked_for=(), left="additive, common", *, locates=Tr
 
 def cause(closed, probability=0.99, plausible=True):
     fraction = None if closed is None else ClosedFraction(closed, closed - 0.1, min(closed + 0.1, 1.0))
-    return SimpleNamespace(closed_fraction=fraction, probability=probability, plausible=plausible)
+    return SimpleNamespace(explained=fraction, probability=probability, plausible=plausible)
 
 
 @pytest.mark.parametrize(

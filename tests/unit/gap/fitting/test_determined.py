@@ -10,7 +10,7 @@ from scipy import stats
 
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting.base import fit_base
-from dtprob.gap.fitting.determined import deviation_of_spread, shared_weights
+from dtprob.gap.fitting.determined import interval_of_spread, shared_weights
 from dtprob.gap.fitting.fit import fit
 from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import model
@@ -62,12 +62,14 @@ def test_the_spread_is_known_as_its_exact_posterior_says(shape, axis):
     spread = SPREAD if axis else 30.0  # of three entries only a spread far above the noise is known at all
     y = -60 + spread * rng.normal(size=shape) + NOISE * rng.normal(size=(LINKS, READINGS))
     problem, found = fitted(effect(shape), y)
-    told = deviation_of_spread(problem, found, "shadowing")
+    low, high = interval_of_spread(problem, found, "shadowing")
+    told = (high - low) / (2 * 1.6449)
     if axis:
-        assert told == pytest.approx(exact_deviation(y.mean(axis=1), NOISE**2 / READINGS), rel=0.05)
+        assert told == pytest.approx(exact_deviation(y.mean(axis=1), NOISE**2 / READINGS), rel=0.1)
         assert shared_weights(problem, found, "shadowing") == 0.0
     else:
-        assert told == pytest.approx(found.spread["shadowing"] / np.sqrt(2 * READINGS), rel=0.35)
+        bounds = found.spread["shadowing"] * np.sqrt(READINGS / stats.chi2.ppf([0.95, 0.05], READINGS))
+        assert (low, high) == pytest.approx(tuple(bounds), rel=0.2)
         assert shared_weights(problem, found, "shadowing") == pytest.approx(READINGS, abs=1.1)
 
 
