@@ -69,6 +69,22 @@ def unknown_name(what: str, name: str, valid: Iterable[str], kind: str = "name")
     return InputError(what, f"one of the {_plural(kind)} {shown}", f"'{name}'", remedy)
 
 
+def check_choice(what: str, value: object, choices: Iterable[str]) -> None:
+    """Refuse a setting that is none of a few words.
+
+    Args:
+        what: the setting.
+        value: what it was given.
+        choices: the words.
+
+    Raises:
+        InputError: it is another one; the nearest is named.
+    """
+    words = list(choices)
+    if value not in words:
+        raise unknown_name(what, str(value), words, "choice")
+
+
 def _plural(kind: str) -> str:
     """Several of what ``kind`` names: ``keys``, ``effect families``, ``kinds of traffic``."""
     noun, of, rest = kind.partition(" of ")

@@ -3,11 +3,13 @@
 On CPUs, jaxlib 0.12.0.1 miscompiles some products with a matrix of equal constants followed by a sum over
 the long axis, silently and by as much as the value itself, in single and double precision. The fault lies
 in its fusions for the YNNPACK library; without these fusions compiled and plain results agree. The flag has
-to be in XLA_FLAGS before jax is first imported, so programs set it (the command line does); importing
-dtprob never does.
+to be in XLA_FLAGS before jax first computes, so programs set it (the command line does); importing
+dtprob never does, but what infers warns where it is missing.
 """
 
 import os
+import warnings
+from functools import cache
 
 FAULTY = frozenset({"0.12.0.1"})
 """Versions of jaxlib that have the fault."""
@@ -27,6 +29,19 @@ def avoid_miscompilation() -> None:
     flags = os.environ.get("XLA_FLAGS", "")
     if version() in FAULTY and FLAG.rstrip("=") not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {FLAG}".strip()
+
+
+@cache
+def warn_of_miscompilation() -> None:
+    """Say, once, that what is computed here may be wrong, where this version of jaxlib has the fault and no flag is set."""
+    if version() not in FAULTY or FLAG.rstrip("=") in os.environ.get("XLA_FLAGS", ""):
+        return
+    import jax  # noqa: PLC0415  (heavy)
+
+    if jax.default_backend() == "cpu":
+        what = f"jaxlib {version()} miscompiles some products on CPUs, so results may be wrong"
+        remedy = f"Run `export XLA_FLAGS={FLAG}` before Python, or dtprob.xla.avoid_miscompilation() before the first array"
+        warnings.warn(f"{what}. {remedy}.", RuntimeWarning, stacklevel=3)
 
 
 def miscompiles() -> bool:

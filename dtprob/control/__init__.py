@@ -13,7 +13,7 @@ from dtprob.control.ippo import IPPO
 from dtprob.control.kernel import Kernel, draw_pool
 from dtprob.control.learner import Budget, Learner, Trained, train
 from dtprob.control.policy import FramePolicy, HistoryPolicy, Policy, TablePolicy, aloha, tabulate, tdma
-from dtprob.control.rollout import evaluate
+from dtprob.control.rollout import Stateless, evaluate
 
 __all__ = [
     "COMA",
@@ -30,6 +30,7 @@ __all__ = [
     "Observation",
     "Policy",
     "SampledInformation",
+    "Stateless",
     "Step",
     "TablePolicy",
     "Trained",

@@ -8,9 +8,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dtprob.control.environment import Environment
-from dtprob.control.policy import Memory, Policy
+from dtprob.control.policy import Memory, Policy, check_size
 from dtprob.control.rollout import Play, Trajectory, begin, play
 from dtprob.errors import InputError
+from dtprob.xla import warn_of_miscompilation
 
 
 class Learner(Protocol):
@@ -82,11 +83,15 @@ def train(
         budget: how much is played.
 
     Raises:
-        InputError: a budget without an environment, or with too few slots between two updates to learn from.
+        InputError: a budget without an environment, or with too few slots between two updates to learn from; a policy or a
+            learner of other devices, buffers or frames.
     """
+    warn_of_miscompilation()
     for name, value, least in (("environments", budget.environments, 1), ("length", budget.length, 2)):
         if value < least:
             raise InputError(f"budget: {name}", f"{least} or more", str(value), "Give a larger number")
+    check_size(environment.kernel, learner)
+    check_size(policy, learner)
     first, second, third = jax.random.split(key, 3)
     kept = learner.start(first, policy)
     now = begin(second, environment, policy, budget.environments)

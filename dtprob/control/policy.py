@@ -121,6 +121,16 @@ class TablePolicy(eqx.Module):
 
     probability: Float[Array, "phase device buffer arrival ack"]
 
+    @property
+    def devices(self) -> int:
+        """How many."""
+        return self.probability.shape[1]
+
+    @property
+    def capacity(self) -> int:
+        """Packets that a buffer holds."""
+        return self.probability.shape[2] - 1
+
     def initial(self) -> Memory:
         """Nothing."""
         return jnp.zeros((self.probability.shape[1], 0))
@@ -154,13 +164,38 @@ def tdma(devices: int, capacity: int, frame: list[list[int]]) -> TablePolicy:
 
 
 def aloha(devices: int, capacity: int, probability: float) -> TablePolicy:
-    """Every device with a packet sends with the same chance in every slot."""
+    """Every device with a packet sends with the same chance in every slot.
+
+    Raises:
+        InputError: a probability outside of [0, 1].
+    """
+    if not 0 <= probability <= 1:
+        raise InputError("probability of aloha", "a number from 0 to 1", f"{probability:g}", "Correct it")
     return TablePolicy(jnp.full((1, devices, capacity + 1, 2, 2), probability))
 
 
 def tabulate(policy: FramePolicy) -> TablePolicy:
     """The table of a memoryless policy; it sends with the same chances."""
     return TablePolicy(jax.nn.sigmoid(jnp.moveaxis(policy.table(), -1, 0)))
+
+
+def check_size(whole: Any, part: Any) -> None:
+    """Refuse a policy or learner of other devices, buffers or frames than what it is used with: indices would be clamped.
+
+    Args:
+        whole: a kernel or a policy.
+        part: a policy or a learner; what either does not tell is not compared.
+
+    Raises:
+        InputError: the first difference.
+    """
+    for name in ("devices", "capacity", "frame"):
+        expected, got = getattr(whole, name, None), getattr(part, name, None)
+        if expected is not None and got is not None and expected != got:
+            what = f"{name} of {type(part).__name__}"
+            raise InputError(
+                what, f"{expected}, as in {type(whole).__name__}", str(got), "Make it with the same"
+            )
 
 
 def unroll(

@@ -1,6 +1,6 @@
 """Playing a policy in an environment: trajectories, and long-run averages on arrivals common to all."""
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -8,7 +8,35 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dtprob.control.environment import Environment, Observation
-from dtprob.control.policy import Memory, Policy, act
+from dtprob.control.policy import Memory, Policy, act, check_size
+from dtprob.errors import InputError
+
+
+@final
+class Stateless(eqx.Module):
+    """A policy without memory as `dtprob.twin` takes it: from a key and the state at the start of a slot to actions.
+
+    Attributes:
+        policy: such as `tdma`, `aloha`, a `FramePolicy` or its table.
+
+    Raises:
+        InputError: a policy that remembers.
+    """
+
+    policy: Policy
+
+    def __check_init__(self) -> None:
+        """Refuse a policy that remembers, since a state does not hold what it does."""
+        size = self.policy.initial().shape[1]
+        if size:
+            got, remedy = f"{size} numbers that each device remembers", "Give a FramePolicy or a table"
+            raise InputError("policy", "one without memory", got, remedy)
+
+    def __call__(self, key: PRNGKeyArray, state: Any) -> Int[Array, " device"]:
+        """The devices' actions."""
+        silent = jnp.zeros_like(state.buffer)
+        seen = Observation(state.buffer, state.arrival, state.ack, silent, state.slot)
+        return act(key, self.policy(self.policy.initial(), seen)[1])
 
 
 class Trajectory(NamedTuple):
@@ -43,7 +71,12 @@ class Play(NamedTuple):
 
 
 def begin(key: PRNGKeyArray, environment: Environment, policy: Policy, count: int) -> Play:
-    """Start episodes in `count` environments."""
+    """Start episodes in `count` environments.
+
+    Raises:
+        InputError: a policy of other devices or buffers.
+    """
+    check_size(environment.kernel, policy)
     keys = jax.random.split(key, count)
     state, observation = jax.vmap(environment.reset)(keys)
     memory = policy.initial()

@@ -220,7 +220,8 @@ def _chosen(known: Sequence[Link], links: Sequence[int] | None, averages: int, l
     if missing or not asked:
         expected = f"a list of numbers among {', '.join(map(str, sorted(numbers)))}"
         raise InputError(f"{NAME} links", expected, str(missing), "Name links that exist")
-    chosen = [link for link in known if link.number in asked]
+    of_number = {link.number: link for link in known}
+    chosen = [of_number[number] for number in asked]
     fewest = min(chosen, key=lambda link: len(link.impulse_response))
     if averages > len(fewest.impulse_response):
         expected = f"at most {len(fewest.impulse_response)}, the packets of link {fewest.number}"

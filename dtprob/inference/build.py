@@ -18,6 +18,7 @@ from dtprob.inference.target import Coordinates, Inputs, Target, free_value
 from dtprob.models.arguments import Data, Model, split_static
 from dtprob.models.declaration import Declaration, declare, trace_model
 from dtprob.models.supported import refuse_unsupported
+from dtprob.xla import warn_of_miscompilation
 
 _NORMAL_IQR = 1.349
 _KEPT_TARGETS = 32
@@ -33,6 +34,7 @@ def build_target(model: Model, data: Data) -> tuple[Target, Inputs]:
         InputError: the data do not fit the model; or the model has a discrete or complex latent site, a
             parameter site, a plate that subsamples, an obs_mask, or nothing latent.
     """
+    warn_of_miscompilation()
     arrays, static = split_static(data)
     arrays = jax.tree.map(jnp.asarray, arrays)
     target = _TARGETS.get(model, arrays, static)

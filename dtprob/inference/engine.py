@@ -10,7 +10,8 @@ from typing import Any, ClassVar, Literal
 
 import jax
 
-from dtprob.errors import InputError, unknown_name
+from dtprob import errors
+from dtprob.errors import InputError
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Model
 
@@ -128,9 +129,7 @@ def check_choice(engine: AbstractEngine, setting: str, choices: Sequence[str]) -
     Raises:
         InputError: it is another one.
     """
-    value = getattr(engine, setting)
-    if value not in choices:
-        raise unknown_name(f"{setting} of engine {engine.name}", str(value), choices, "choice")
+    errors.check_choice(f"{setting} of engine {engine.name}", getattr(engine, setting), choices)
 
 
 def check_initial(initial: Any) -> None:

@@ -7,7 +7,7 @@ e^{+j w t}.
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +15,7 @@ import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Complex, Float
 
+from dtprob.errors import check_choice
 from dtprob.models.declaration import model
 from dtprob.models.scene import (
     AXES,
@@ -172,6 +173,7 @@ def _channel(
 
 def _packet_phase(phase: Phase, shape: tuple[int, int, int, int, int]) -> Any:
     """A phase per link and snapshot, (link, snapshot, 1) rad, or zero where packets are coherent."""
+    check_choice("phase", phase, get_args(Phase.__value__))
     if phase == "coherent":
         return jnp.zeros((1, 1, 1))
     with numpyro.plate("link", shape[0], dim=-2), numpyro.plate("snapshot", shape[1], dim=-1):

@@ -9,7 +9,7 @@ from `dtprob.raytracing.calibration.project`. Effects that change the paths' res
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +19,7 @@ import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Complex, Float
 from numpyro import handlers
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, check_choice
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.models.declaration import model
 from dtprob.models.scene import AXES, TRACED, Materials, site, traced_gain, unknown_noise_power, unknown_phase
@@ -27,6 +27,8 @@ from dtprob.raytracing.calibration import Statistics, project
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.slab import Law
 
+_TINY: Final = 1e-30
+"""Least energy of what is left, where it counts."""
 type PathPhase = Literal["coherent", "per_packet", "per_path"]
 """Phases as traced; with an unknown phase of each link and snapshot; with an unknown error of each path besides."""
 
@@ -119,9 +121,11 @@ def compressed_channel(
     noise = unknown_noise_power(noise_power, paths).reshape(-1, 1, 1)
     rank = jnp.sum(kept, axis=1)[:, None]
     of_link, of_snapshot = numpyro.plate("link", links, dim=-3), numpyro.plate("snapshot", snapshots, dim=-2)
-    left = -(size - rank) * jnp.log(noise[..., 0]) - residual / noise[..., 0]
-    with of_link, of_snapshot:  # where clusters are weighted it counts with them
-        numpyro.factor("residual", left[..., None])
+    free = jnp.broadcast_to(size - rank, residual.shape)[..., None]
+    with of_link, of_snapshot, handlers.mask(mask=free > 0):
+        # the energy of so many complex normal entries; where none is left it tells nothing
+        energy = dist.Gamma(jnp.maximum(free, 1), 1 / noise)
+        numpyro.sample("left", energy, obs=jnp.maximum(residual[..., None], _TINY))
     with (
         of_link,
         of_snapshot,
@@ -133,6 +137,7 @@ def compressed_channel(
 
 
 def _angles(phase: PathPhase, shape: tuple[int, int, int]) -> Any:
+    check_choice("phase", phase, get_args(PathPhase.__value__))
     if phase == "coherent":
         return jnp.zeros((1, 1, 1))
     with numpyro.plate("link", shape[0], dim=-3), numpyro.plate("snapshot", shape[1], dim=-2):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ import numpyro.distributions as dist
 from jaxtyping import Array, Complex
 from numpyro.distributions import constraints, transforms
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, check_choice
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.raytracing import field
 from dtprob.raytracing.beyond import with_all
@@ -76,7 +76,12 @@ def channel_shape(
 
 
 def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, jax.Array]:
-    """Permittivity (relative) and conductivity (S/m) of each object, around the scene's own values."""
+    """Permittivity (relative) and conductivity (S/m) of each object, around the scene's own values.
+
+    Raises:
+        InputError: `materials` is none of the choices.
+    """
+    check_choice("materials", materials, get_args(Materials.__value__))
     permittivity, conductivity = jnp.asarray(paths.permittivity), jnp.asarray(paths.conductivity)
     if materials == "known":
         return permittivity, conductivity

@@ -21,7 +21,7 @@ from dtprob.inference.posterior import Sampler
 from dtprob.models.multi_access.abduction import Transition, abduct
 from dtprob.models.multi_access.transition import Kernel, State
 from dtprob.twin.predict import Prediction, check_counts, sampled
-from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, rollout
+from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, rollout
 
 SITES = ("log_arrival", "log_reception")
 
@@ -100,6 +100,8 @@ def average_effect(
         InputError: counts below 1, fewer than 2 episodes, or a sampler that lacks a site.
     """
     check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
+    for arm in (baseline, alternative):
+        check_policy(arm.policy)
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
 
@@ -196,6 +198,7 @@ def what_if(
         InputError: no draws, an episode of another network, or one that could not happen under a draw of the parameters.
     """
     check_counts({"draws": (draws, 1)})
+    check_policy(policy)
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, SITES)
     happened = transitions(episode)
     _check_buffers(kernel, episode)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 from typing import final
 
 import jax
@@ -94,13 +95,12 @@ def coverage_map(
     return CoverageMap(np.asarray(_powers(paths, found[0], found[1], law)))
 
 
+@partial(jax.jit, static_argnames="law")
 def _powers(paths: PathSet, permittivity: Array, conductivity: Array, law: Law) -> Array:
-    @jax.jit
-    def each(paths: PathSet, permittivity: Array, conductivity: Array) -> Array:
-        def one(materials: tuple[Array, Array]) -> Array:
-            gain = path_gain(paths, *materials, law=law)
-            return jnp.sum(jnp.real(gain) ** 2 + jnp.imag(gain) ** 2, axis=1)
+    """Power of each link for each draw, (draw, link)."""
 
-        return jax.lax.map(one, (permittivity, conductivity))  # a draw at a time: memory of one map
+    def one(materials: tuple[Array, Array]) -> Array:
+        gain = path_gain(paths, *materials, law=law)
+        return jnp.sum(jnp.real(gain) ** 2 + jnp.imag(gain) ** 2, axis=1)
 
-    return each(paths, permittivity, conductivity)
+    return jax.lax.map(one, (permittivity, conductivity))  # a draw at a time: memory of one map

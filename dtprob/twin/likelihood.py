@@ -16,6 +16,7 @@ from numpyro.infer.util import compute_log_probs
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, split_static
 from dtprob.models.declaration import declare
+from dtprob.xla import warn_of_miscompilation
 
 type Likelihoods = dict[str, Float[np.ndarray, "draw window"]]
 
@@ -40,13 +41,19 @@ def window_likelihoods(
         apart: axes whose entries are factors of their own, as "cluster" makes arrivals[0] and arrivals[1].
 
     Raises:
-        InputError: draws of a latent site are missing, or an observed site has no such window.
+        InputError: draws of a latent site are missing, an observed site has no such window, a window's likelihood is not a
+            number, or the model adds to it by `numpyro.factor`, which belongs to no window.
     """
+    warn_of_miscompilation()
     declaration = declare(model, data)
     missing = [name for name in declaration.latent if name not in draws]
     if missing:
         remedy = "Sample them from a posterior of this model"
         raise InputError("draws", f"every latent site of {declaration.name}", f"no {missing[0]!r}", remedy)
+    if declaration.factors:
+        remedy = "Observe a distribution instead, or watch by a model that does"
+        expected, got = "all that data tell at observed sites", f"numpyro.factor {declaration.factors[0]!r}"
+        raise InputError(f"windows of {declaration.name}", expected, got, remedy)
     axis = window or declaration.cluster
     axes = {name: site.axes for name, site in declaration.observed.items()}
     for name, own in axes.items():
@@ -57,7 +64,15 @@ def window_likelihoods(
     arrays, static = split_static(data)
     arrays = jax.tree.map(jnp.asarray, arrays)
     found = _likelihoods(latent, arrays, static, model, axes, window=str(axis), apart=tuple(apart))
-    return {label: part for name, value in found.items() for label, part in _parts(name, np.asarray(value))}
+    told = {label: part for name, value in found.items() for label, part in _parts(name, np.asarray(value))}
+    for label, part in told.items():
+        lost = np.isnan(part).any(axis=0)
+        if lost.any():
+            expected, got = "a number of each window", f"NaN in window {int(lost.argmax())}"
+            raise InputError(
+                f"log likelihood of {label}", expected, got, "Correct the reading there, or mask it"
+            )
+    return told
 
 
 @eqx.filter_jit
@@ -75,10 +90,18 @@ def _likelihoods(
 
     def one(value: Mapping[str, Array]) -> dict[str, Array]:
         fixed = handlers.substitute(handlers.seed(model, jax.random.key(0)), data=dict(value))
-        terms, _ = compute_log_probs(fixed, (), dict(eqx.combine(arrays, static)), {}, sum_log_prob=False)
-        return {name: _summed(terms[name], own, window, apart) for name, own in axes.items()}
+        terms, trace = compute_log_probs(fixed, (), dict(eqx.combine(arrays, static)), {}, sum_log_prob=False)
+        told = {name: _told(terms[name], trace[name]["value"]) for name in axes}
+        return {name: _summed(told[name], own, window, apart) for name, own in axes.items()}
 
     return jax.lax.map(one, latent, batch_size=_BATCH)
+
+
+def _told(term: Array, value: Any) -> Array:
+    """A site's log likelihoods; NaN for a value that is no number, which NumPyro takes for one that cannot be."""
+    lost = jnp.isnan(jnp.asarray(value, jnp.result_type(value, float)))
+    lost = jnp.any(lost, axis=tuple(range(term.ndim, lost.ndim)))
+    return jnp.where(lost & jnp.isneginf(term), jnp.nan, term)
 
 
 def _summed(term: Array, axes: tuple[str, ...], window: str, apart: Sequence[str]) -> Array:

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dtprob.errors import InputError
 from dtprob.inference.posterior import Sampler
-from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, rollout
+from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, rollout
 
 
 @final
@@ -97,6 +97,7 @@ def predict(
         InputError: counts below 1, fewer than 2 episodes, or a sampler that lacks a site.
     """
     check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
+    check_policy(policy)
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
     return Prediction(np.asarray(_values(keys, parameters, kernel, policy, metric, horizon=horizon), float))

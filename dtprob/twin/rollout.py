@@ -9,11 +9,24 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from dtprob.errors import InputError
+
 type Parameters = Mapping[str, Array]
 type Policy = Callable[[PRNGKeyArray, Any], Int[Array, " device"]]
 """From a key and the state at the start of a slot to each device's action."""
 type Metric = Callable[[Any], Float[Array, ""]]
 """From the slots of an episode, each field (slot, ...), to a number."""
+
+
+def check_policy(policy: object) -> None:
+    """Refuse a policy that takes what devices see in place of a key and the state.
+
+    Raises:
+        InputError: such a policy.
+    """
+    if hasattr(policy, "initial"):
+        remedy = "Give dtprob.control.Stateless(policy)"
+        raise InputError("policy", "a function of a key and the state", type(policy).__name__, remedy)
 
 
 class Steps(Protocol):
@@ -64,7 +77,13 @@ def overflow(slots: Any) -> Float[Array, ""]:
 
 
 def random_access(devices: int, probability: float | Array) -> Policy:
-    """Slotted ALOHA: each device with a packet transmits with this probability."""
+    """Slotted ALOHA: each device with a packet transmits with this probability.
+
+    Raises:
+        InputError: a probability outside of [0, 1].
+    """
+    if isinstance(probability, int | float) and not 0 <= probability <= 1:
+        raise InputError("probability of random access", "from 0 to 1", f"{probability:g}", "Correct it")
 
     def act(key: PRNGKeyArray, state: Any) -> Int[Array, " device"]:
         chosen = jax.random.bernoulli(key, probability, (devices,))

@@ -62,7 +62,8 @@ def threshold(normal: Float[np.ndarray, " window"], rate: float) -> float:
         rate: probability of a false alarm per window.
 
     Raises:
-        InputError: a rate outside of (0, 1), too few windows for it, or one whose statistic is not a number.
+        InputError: a rate outside of (0, 1), too few windows for it, one whose statistic is not a number, or so many that
+            cannot be that nothing would ever be an alarm.
     """
     if not 0 < rate < 1:
         raise InputError("rate of false alarms", "a probability between 0 and 1", f"{rate:g}", "Correct it")
@@ -77,7 +78,12 @@ def threshold(normal: Float[np.ndarray, " window"], rate: float) -> float:
         needed = int(np.ceil(1 / rate)) - 1
         remedy = "Log more normal slots, choose shorter windows, or allow more false alarms"
         raise InputError(f"normal windows for a rate of {rate:g}", f"{needed} or more", str(n), remedy)
-    return float(np.sort(normal)[place - 1])
+    found = float(np.sort(normal)[place - 1])
+    if np.isposinf(found):
+        got = f"{int(np.isposinf(normal).sum())} of {n} that cannot be under any draw"
+        remedy = "Learn from windows like these, or leave out those that are not normal"
+        raise InputError("normal windows", "windows that can be under what was learned", got, remedy)
+    return found
 
 
 def p_value(

@@ -2,7 +2,9 @@
 
 import pickle
 
-from dtprob.errors import DtprobError, InputError, nearest, unknown_name
+import pytest
+
+from dtprob.errors import DtprobError, InputError, check_choice, nearest, unknown_name
 
 
 def test_the_sentence():
@@ -32,3 +34,12 @@ def test_unknown_name_asks_or_lists():
         assert f"one of the {kinds} a," in str(unknown_name("x", "a1", ["a", "b"], kind))
     assert str(unknown_name("x", "q", [], "option")) == "x: expected no options, got 'q'. Leave it out."
     assert str(unknown_name("x", "q", [f"n{i}" for i in range(100, 130)])).count(",") == 17
+
+
+def test_a_choice_that_is_none_is_answered_by_the_nearest() -> None:
+    check_choice("phase", "coherent", ("coherent", "none"))
+    with pytest.raises(
+        InputError,
+        match=r"phase: expected one of the choices coherent, none, got 'Coherent'\. Did you mean 'coherent'",
+    ):
+        check_choice("phase", "Coherent", ("coherent", "none"))

@@ -2,10 +2,15 @@
 
 import subprocess
 import sys
+import warnings
 
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 
 from dtprob import xla
+from dtprob.inference.build import build_target
 
 PROGRAM = """
 from dtprob import xla
@@ -28,6 +33,24 @@ def test_other_versions_are_left_alone(monkeypatch):
     monkeypatch.delenv("XLA_FLAGS", raising=False)
     xla.avoid_miscompilation()
     assert "XLA_FLAGS" not in xla.os.environ
+
+
+@pytest.mark.parametrize("flagged", [False, True])
+def test_what_infers_warns_where_the_flag_is_missing(flagged, monkeypatch):
+    monkeypatch.setattr(xla, "FAULTY", frozenset({xla.version()}))
+    monkeypatch.setenv("XLA_FLAGS", xla.FLAG if flagged else "")
+    data = {"y": np.zeros(3)}
+    for _ in range(2):
+        xla.warn_of_miscompilation.cache_clear()
+        with warnings.catch_warnings(record=True) as told:
+            warnings.simplefilter("always")
+            build_target(normal, data)
+            build_target(normal, data)
+        assert len([w for w in told if "export XLA_FLAGS" in str(w.message)]) == (0 if flagged else 1)
+
+
+def normal(y=None):
+    numpyro.sample("y", dist.Normal(numpyro.sample("mean", dist.Normal(0.0, 1.0)), 1.0).expand([3]), obs=y)
 
 
 def test_tests_themselves_run_on_a_sound_compiler():

@@ -42,6 +42,7 @@ from dtprob.inference.posterior import Sampler
 from dtprob.models.arguments import Data, Model, as_arrays, split_static, within
 from dtprob.models.declaration import Declaration, declare
 from dtprob.models.supported import check_supported
+from dtprob.xla import warn_of_miscompilation
 
 _OF_EACH: Final = 10
 """Draws of a reference for each of its unknowns, if it has as many."""
@@ -73,6 +74,7 @@ class Problem:
         *,
         decentre: bool = True,
     ) -> None:
+        warn_of_miscompilation()
         data = as_arrays(data)
         self.data, self.effects = data, tuple(effects)
         self.arrays, static = split_static(data)

@@ -185,17 +185,29 @@ def _boxes(places: np.ndarray, per_region: int) -> list[tuple[np.ndarray, _Box]]
     leaves: list[tuple[np.ndarray, _Box]] = []
     while waiting:
         members, box = waiting.pop()
-        feature = int(np.argmax(np.ptp(scaled[members], axis=0)))
-        middle = float(np.median(places[members, feature]))
-        left = places[members, feature] < middle
-        if min(left.sum(), (~left).sum()) < per_region:
+        halves = _halved(places[members], np.ptp(scaled[members], axis=0), per_region)
+        if halves is None:
             leaves.append((members, box))
             continue
+        feature, middle, left = halves
         for side, inside in ((1, left), (0, ~left)):
             edges = box[0].copy(), box[1].copy()
             edges[side][feature] = middle
             waiting.append((members[inside], edges))
     return leaves
+
+
+def _halved(places: np.ndarray, extent: np.ndarray, per_region: int) -> tuple[int, float, np.ndarray] | None:
+    """The widest feature at whose median samples part into two large enough sides, the median, and who is below it.
+
+    Many may stand at the median itself, as of a feature of two values; none where no feature parts them.
+    """
+    for feature in np.argsort(-extent, kind="stable"):
+        middle = float(np.median(places[:, feature]))
+        left = places[:, feature] < middle
+        if min(left.sum(), (~left).sum()) >= per_region:
+            return int(feature), middle, left
+    return None
 
 
 def _region(values: np.ndarray, box: _Box, level: float) -> Region:

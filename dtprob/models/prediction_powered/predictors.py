@@ -5,12 +5,15 @@ one `vmap` over the masks that leave out a fold.
 """
 
 import abc
-from typing import Any, Protocol, final, runtime_checkable
+from typing import Any, Final, Protocol, final, runtime_checkable
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
+
+_DISTANCES: Final = 4_000_000
+"""Distances between samples that are held at once."""
 
 
 @runtime_checkable
@@ -106,10 +109,15 @@ class Neighbours(JaxPredictor):
         # about their middle: coordinates of a map are large beside what lies between places
         middle = weight @ places / jnp.sum(weight)
         x, places = x - middle, places - middle
-        square = jnp.sum(x**2, axis=1)[:, None] + jnp.sum(places**2, axis=1) - 2 * x @ places.T
-        _, index = jax.lax.top_k(-jnp.where(weight > 0, square, jnp.inf), min(self.count, len(places)))
+        size = jnp.sum(places**2, axis=1)
+
+        def nearest(row: Float[Array, " feature"]) -> Array:
+            square = jnp.sum(row**2) + size - 2 * places @ row
+            return jax.lax.top_k(-jnp.where(weight > 0, square, jnp.inf), min(self.count, len(places)))[1]
+
+        index = jax.lax.map(nearest, x, batch_size=max(1, _DISTANCES // len(places)))
         away = jnp.sum((x[:, None] - places[index]) ** 2, axis=-1)
-        reach, precision = jnp.max(jnp.where(weight > 0, jnp.sum(places**2, axis=1), 0.0)), jnp.finfo(x.dtype)
+        reach, precision = jnp.max(jnp.where(weight > 0, size, 0.0)), jnp.finfo(x.dtype)
         floor = precision.eps**2 * reach + precision.tiny**0.5
         closeness = jnp.where(weight[index] > 0, (floor + away) ** (-self.power / 2), 0.0)
         share = closeness / jnp.sum(closeness, axis=1, keepdims=True)

@@ -1,27 +1,26 @@
 """What is done in each phase: from a state to the next, with an entry of the history that says what and why."""
 
 from collections.abc import Callable
-from typing import Any, Final, NamedTuple
+from typing import Final, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from dtprob.control import (
     COMA,
     Budget,
     Environment,
     FramePolicy,
-    Observation,
+    Stateless,
     TablePolicy,
     collector,
     draw_pool,
     tabulate,
     train,
 )
-from dtprob.control.policy import act
 from dtprob.twin.predict import Prediction, predict
 from dtprob.twin.rollout import throughput
 from dtprob.workflow.loop.diagnosis import diagnosed
@@ -50,18 +49,6 @@ class Twin(NamedTuple):
     case: TwinCase
     physical: Physical
     say: Say
-
-
-class Acting(eqx.Module):
-    """A table of chances as a policy for prediction."""
-
-    table: TablePolicy
-
-    def __call__(self, key: PRNGKeyArray, state: Any) -> Int[Array, " device"]:
-        """The devices' actions."""
-        silent = jnp.zeros_like(state.buffer)
-        seen = Observation(state.buffer, state.arrival, state.ack, silent, state.slot)
-        return act(key, self.table(self.table.initial(), seen)[1])
 
 
 def collect(twin: Twin, state: State) -> State:
@@ -196,7 +183,7 @@ def _foreseen(twin: Twin, state: State, policy: Chances) -> Prediction:
         _key(twin.case, state),
         twin.case.kernel,
         known(twin.case, state),
-        policy=Acting(TablePolicy(jnp.asarray(policy, jnp.result_type(float)))),
+        policy=Stateless(TablePolicy(jnp.asarray(policy, jnp.result_type(float)))),
         metric=throughput,
         horizon=_FORESEEN,
         draws=100,

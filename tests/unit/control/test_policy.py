@@ -7,17 +7,34 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dtprob.control import FramePolicy, HistoryPolicy, TablePolicy, aloha, evaluate, tabulate, tdma
+from dtprob.control import (
+    COMA,
+    IPPO,
+    Budget,
+    FramePolicy,
+    HistoryPolicy,
+    Stateless,
+    TablePolicy,
+    aloha,
+    evaluate,
+    tabulate,
+    tdma,
+    train,
+)
 from dtprob.control.device import Seen, step
 from dtprob.control.environment import Observation
 from dtprob.control.export import load, save
 from dtprob.control.policy import unroll
 from dtprob.control.rollout import begin, play
 from dtprob.errors import InputError
-from dtprob.physical.multi_access import average, chain
+from dtprob.inference import PointMass
+from dtprob.physical.multi_access import PhysicalKernel, average, chain
+from dtprob.twin.predict import predict
+from dtprob.twin.rollout import random_access, throughput
 from tests.unit.control.networks import NETWORK, PAIR, world
 
 KEY = jax.random.key(0)
+NETWORK_KERNEL = PhysicalKernel.of(NETWORK)
 
 
 def observations(slots, devices=4, seed=0):
@@ -146,3 +163,40 @@ def test_policies_meet_the_same_arrivals():
         seen.append(play(KEY, environment, policy, now, 30)[1].observation.arrival)
     assert np.array_equal(*seen)
     assert isinstance(policy, TablePolicy)
+
+
+@pytest.mark.parametrize("probability", [54.0, -0.1])
+def test_a_chance_is_between_zero_and_one(probability):
+    with pytest.raises(InputError, match="from 0 to 1"):
+        aloha(4, 1, probability)
+    with pytest.raises(InputError, match="from 0 to 1"):
+        random_access(4, probability)
+
+
+def test_what_is_of_another_size_is_refused_and_not_clamped():
+    network = world(NETWORK)
+    devices, capacity = NETWORK_KERNEL.devices, NETWORK_KERNEL.capacity
+    for policy, what in (
+        (FramePolicy(KEY, devices, capacity=capacity + 1), "capacity of FramePolicy"),
+        (aloha(devices, capacity + 2, 0.5), "capacity of TablePolicy"),
+        (HistoryPolicy(KEY, devices + 1), "devices of HistoryPolicy"),
+    ):
+        with pytest.raises(InputError, match=what):
+            evaluate(KEY, network, policy, 10, 2)
+    budget = Budget(8, environments=2, length=4)
+    with pytest.raises(InputError, match="frame of COMA: expected 8, as in FramePolicy, got 4"):
+        train(KEY, COMA(), FramePolicy(KEY, devices, frame=8, capacity=capacity), network, budget)
+    with pytest.raises(InputError, match="capacity of IPPO"):
+        train(KEY, IPPO(capacity=capacity + 1), FramePolicy(KEY, devices, capacity=capacity), network, budget)
+
+
+def test_a_policy_without_memory_foresees_what_it_reaches():
+    policy = aloha(4, 1, 0.25)
+    given = {"metric": throughput, "horizon": 2000, "draws": 1, "episodes": 20}
+    with pytest.raises(InputError, match="Stateless"):
+        predict(KEY, NETWORK_KERNEL, PointMass(NETWORK.parameters), policy=policy, **given)
+    found = predict(KEY, NETWORK_KERNEL, PointMass(NETWORK.parameters), policy=Stateless(policy), **given)
+    played = evaluate(KEY, world(NETWORK, horizon=2000), policy, 2000, 20).throughput
+    assert found.mean == pytest.approx(float(played.mean()), abs=0.02)
+    with pytest.raises(InputError, match="one without memory"):
+        Stateless(HistoryPolicy(KEY, 4))

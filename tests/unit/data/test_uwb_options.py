@@ -9,10 +9,10 @@ from dtprob.errors import InputError
 
 @pytest.fixture
 def two_links(monkeypatch):
-    taps = np.random.default_rng(0).normal(size=(3, 16)) + 0j
+    taps = {n: np.random.default_rng(n).normal(size=(3, 16)) + 0j for n in (4, 9)}
     place = np.zeros(2)
     links = tuple(
-        uwb_apartment.Link(n, place, place + 1, "LOS", 1.4, 1e-9, taps, np.zeros(3)) for n in (4, 9)
+        uwb_apartment.Link(n, place, place + 1, "LOS", 1.4, 1e-9, taps[n], np.zeros(3)) for n in (4, 9)
     )
     monkeypatch.setattr(uwb_apartment, "read_links", lambda _: links)
     monkeypatch.setattr(uwb_apartment, "read_radio", lambda _: uwb_apartment.Radio(4e9, 5e8, 1e-9))
@@ -35,3 +35,8 @@ def test_options_that_cannot_be_are_named(two_links, options, message):
 
 def test_one_packet_may_be_an_average(two_links):
     assert uwb_apartment.channels(links=[9], averages=3).channel.shape[:2] == (1, 3)
+
+
+def test_links_come_in_the_order_that_was_asked_for(two_links):
+    both, back = (uwb_apartment.channels(links=links, averages=3).channel for links in ([4, 9], [9, 4]))
+    np.testing.assert_array_equal(back, both[::-1])

@@ -175,3 +175,10 @@ def test_what_lies_outside_of_the_resampled_plate_is_refused():
     data = {"y": jnp.zeros(4), "z": jnp.zeros(())}
     with pytest.raises(InputError, match="every observed site in the plate 'row', got 'z' outside"):
         Ensemble(resample="weights")(KEY, beside, data)
+
+
+def test_settings_of_another_base_are_refused():
+    with pytest.raises(InputError, match="none with base point"):
+        Ensemble(members=4, settings={"objective": "maximum_likelihood"})
+    with pytest.raises(InputError, match="a value for each site by name"):
+        Ensemble(members=4, initial="zzz")

@@ -301,3 +301,13 @@ def test_settings_are_checked():
         RunOptions(resume=True)
     with pytest.raises(InputError, match="one typed JAX key"):
         NUTS()(jax.random.PRNGKey(0), normal, normal_data())
+
+
+def test_a_checkpoint_may_be_named_in_words(tmp_path):
+    file = str(tmp_path / "run.h5")
+    first = NUTS(**SHORT)(KEY, normal, normal_data(), options=RunOptions(checkpoint=file, chunk=10))
+    again = NUTS(**SHORT)(
+        KEY, normal, normal_data(), options=RunOptions(checkpoint=file, resume=True, chunk=10)
+    )
+    for name, draws in first.draws.items():
+        np.testing.assert_array_equal(again.draws[name], draws)

@@ -19,6 +19,7 @@ from dtprob.models.compressed_channel import (
 from dtprob.raytracing.calibration import project
 from dtprob.raytracing.field import frequency_response, path_gain, synthesize
 from dtprob.testing import check_model
+from dtprob.twin.likelihood import window_likelihoods
 from tests import small_world
 
 TONES = jnp.linspace(-40e6, 40e6, 5)
@@ -130,3 +131,42 @@ def test_members_of_an_ensemble_weigh_what_is_left_of_a_link_too(paths):
         for model, data in ((ray_traced_channel, whole), (compressed_channel, short))
     ]
     assert spread[1] == pytest.approx(spread[0], rel=0.05)
+
+
+def test_noise_shows_in_the_likelihood_of_each_link(paths):
+    """Ten times the noise in one link lowers its likelihood by as much as that of its whole channel, constants apart."""
+    random = np.random.default_rng(0)
+    full = {"paths": paths, "subcarrier_frequency": TONES, "rx_array": ARRAY, "noise_power": 1e-9}
+    full |= {"snapshot_time": jnp.arange(2.0)}
+    values = point(ray_traced_channel, full, 0)
+    drawn = handlers.trace(handlers.substitute(handlers.seed(ray_traced_channel, 0), data=values)).get_trace(
+        **full
+    )
+    quiet, draws = (
+        drawn["channel"]["value"],
+        {name: np.asarray(value)[None] for name, value in values.items()},
+    )
+    noise = np.sqrt(1e-8 / 2) * (
+        random.normal(size=(2, *quiet.shape)) * np.array([1, 1j]).reshape(2, *[1] * 5)
+    ).sum(0)
+    told = []
+    for channel in (quiet, np.asarray(quiet) + noise):
+        whole = window_likelihoods(ray_traced_channel, {**full, "channel": jnp.asarray(channel)}, draws)
+        short = {"paths": paths, "noise_power": 1e-9, "phase": "coherent"}
+        short |= compress(project(paths, TONES, jnp.asarray(channel), rx_array=ARRAY))
+        parts = window_likelihoods(compressed_channel, short, draws)
+        told.append((whole["channel"][0], sum(part[0] for part in parts.values()), short["residual"]))
+    (before, short_before, left), (after, short_after, more) = told
+    free = np.asarray(short["size"] - np.sum(short["kept"], axis=1))[:, None]
+    constants = ((free - 1) * np.log(np.asarray(more) / np.asarray(left))).sum(axis=1)
+    np.testing.assert_allclose(short_after - short_before - constants, after - before, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", [ray_traced_channel, phase_error_channel])
+def test_choices_are_checked(paths, model):
+    data = {"paths": paths, "subcarrier_frequency": TONES}
+    with pytest.raises(InputError, match=r"materials: .*Did you mean 'per_object'"):
+        handlers.seed(model, 0)(**data, materials="per_objects")
+    if model is ray_traced_channel:
+        with pytest.raises(InputError, match=r"phase: .*Did you mean 'coherent'"):
+            handlers.seed(model, 0)(**data, phase="Coherent")

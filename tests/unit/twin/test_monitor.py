@@ -1,7 +1,10 @@
 """A monitor on any model and sampler: likelihoods, thresholds, which factor changed."""
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
 import pytest
 
 from dtprob.errors import InputError
@@ -10,6 +13,7 @@ from dtprob.models.dirichlet import log_shares
 from dtprob.models.multi_access import multi_access, priors, records, window_counts
 from dtprob.twin.likelihood import table_likelihoods, window_likelihoods
 from dtprob.twin.monitor import Monitor
+from dtprob.twin.statistics import threshold
 from tests.small_network import CLUSTERS, RECEPTION, simulate
 
 
@@ -90,3 +94,39 @@ def test_what_cannot_be_watched_is_refused(monitor, learned):
     few = {"log_arrival": monitor.draws["log_arrival"]}
     with pytest.raises(InputError, match="every latent site of multi_access, got no 'log_reception'"):
         window_likelihoods(multi_access, windows(simulate(20, 0)), few)
+
+
+def readings(y=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+    with numpyro.plate("window", 200, dim=-2), numpyro.plate("reading", 4, dim=-1):
+        numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+
+def with_a_factor(y=None):
+    readings(y)
+    numpyro.factor("more", -1.0)
+
+
+def test_a_reading_that_is_no_number_is_told_and_not_taken_for_a_change():
+    draws = {"level": np.zeros(5)}
+    y = np.random.default_rng(0).normal(size=(200, 4))
+    y[3, 1] = np.nan
+    plain = Monitor(readings, draws, statistic="disagreement", rate=0.05)
+    with pytest.raises(
+        InputError, match="log likelihood of y: expected a number of each window, got NaN in window 3"
+    ):
+        plain.calibrated({"y": jnp.asarray(y)})
+    with pytest.raises(InputError, match="NaN in window 3"):
+        plain.calibrated({"y": jnp.asarray(np.nan_to_num(y))}).watch({"y": jnp.asarray(y)})
+
+
+def test_what_belongs_to_no_window_is_refused():
+    with pytest.raises(InputError, match=r"got numpyro\.factor 'more'"):
+        window_likelihoods(with_a_factor, {"y": jnp.zeros((200, 4))}, {"level": np.zeros(2)})
+
+
+def test_normal_windows_that_cannot_be_are_no_threshold():
+    statistic = np.where(np.arange(100) < 8, np.inf, np.arange(100.0))
+    assert np.isfinite(threshold(statistic, 0.1))
+    with pytest.raises(InputError, match="8 of 100 that cannot be under any draw"):
+        threshold(statistic, 0.05)

@@ -11,7 +11,7 @@ from dtprob.raytracing.calibration import project
 from dtprob.raytracing.field import frequency_response, path_gain, steering, synthesize
 from dtprob.raytracing.walls import between_walls
 from dtprob.twin.beamforming import Beams, gathered, statistical_beams
-from dtprob.twin.coverage import CoverageMap, coverage_map
+from dtprob.twin.coverage import CoverageMap, _powers, coverage_map
 from dtprob.twin.localise import localise
 
 KEY = jax.random.key(0)
@@ -53,6 +53,14 @@ def test_a_map_of_one_calibration_has_no_spread(paths):
     assert found.covered.tolist() == [True]
     assert found.outage(0.5 * power(paths, 4.0, 0.1)).tolist() == [0.0]
     assert found.outage(2.0 * power(paths, 4.0, 0.1)).tolist() == [1.0]
+
+
+def test_maps_of_one_size_are_compiled_once(paths):
+    before = _powers._cache_size()
+    for permittivity in (4.0, 5.0):
+        values = {"permittivity": np.full(3, permittivity), "conductivity": np.full(3, 0.1)}
+        coverage_map(KEY, PointMass(values), paths, draws=7)
+    assert _powers._cache_size() == before + 1
 
 
 def test_a_map_spreads_as_the_materials_do(paths):

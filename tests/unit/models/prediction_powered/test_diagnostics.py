@@ -83,3 +83,17 @@ def test_one_label_in_a_region_proves_nothing():
     (region,) = bias_map(sample, per_region=1).regions
     assert region.p_value == 1.0
     assert np.isinf(region.bias.high)
+
+
+def test_a_feature_of_two_values_hides_no_region():
+    """Its median halves nothing, and others go on being halved."""
+    rng = np.random.default_rng(0)
+    u = rng.uniform(size=4000)
+    x = np.column_stack([u, rng.random(4000) < 0.3])
+    truth = rng.normal(size=4000)
+    guess = truth + 1.0 * ((u > 0.6) & (u < 0.7)) + 0.1 * rng.normal(size=4000)
+    sample = Sample(x=x, y=truth, prediction=guess, x_unlabelled=x, prediction_unlabelled=guess)
+    found = bias_map(sample)
+    assert len(found.regions) > 32
+    worst = min(found.biased(), key=lambda region: region.bias.value)
+    assert 0.58 < worst.low[0] < worst.high[0] < 0.72

@@ -9,6 +9,7 @@ import pytest
 from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.neighbors import KNeighborsRegressor
 
+from dtprob.models.prediction_powered import predictors as predictors_module
 from dtprob.models.prediction_powered.estimate import estimate
 from dtprob.models.prediction_powered.neural import Neural
 from dtprob.models.prediction_powered.predictors import Neighbours, Ridge
@@ -121,3 +122,16 @@ def test_neighbours_do_not_depend_on_the_origin(offset):
     places, labels = jnp.asarray(rng.uniform(0, 50, (200, 2)) + offset), jnp.arange(200.0)
     learned = Neighbours(3).train(KEY, places, labels, jnp.ones(200))
     np.testing.assert_allclose(Neighbours(3).predict(learned, places), labels, atol=1e-6)
+
+
+def test_neighbours_are_the_same_a_few_rows_at_a_time(monkeypatch):
+    """With distances of all rows at once, 65,536 by 3,000 in a chunk, they would take gigabytes."""
+    rng = np.random.default_rng(0)
+    places, rows, labels = rng.normal(size=(300, 3)), rng.normal(size=(1000, 3)), rng.normal(size=300)
+    learned = (jnp.asarray(places), jnp.asarray(labels), jnp.ones(300))
+    whole = Neighbours().predict(learned, jnp.asarray(rows))
+    monkeypatch.setattr(predictors_module, "_DISTANCES", 7 * 300)
+    few = Neighbours().predict(learned, jnp.asarray(rows))
+    np.testing.assert_allclose(few, whole, rtol=1e-12)
+    memory = jax.jit(Neighbours().predict).lower(learned, jnp.asarray(rows)).compile().memory_analysis()
+    assert memory.temp_size_in_bytes < 1000 * 300 * 8
