@@ -1,13 +1,17 @@
 # The environment is .venv at the root; every target brings it up to date first (at once when nothing has changed).
 BIN := .venv/bin
 
-.PHONY: setup demo test study lint bench lock
+.PHONY: setup demo docs test study lint bench lock
 
 setup:
 	@sh scripts/setup
 
 demo: setup
 	$(BIN)/dtprob demo --out out/demo
+
+# They are plain Markdown; this runs what they tell you to write.
+docs: setup
+	$(BIN)/python -m pytest tests/unit/test_docs.py tests/unit/test_readme.py
 
 PYTEST := $(BIN)/python -m pytest -n 2 --dist loadfile --no-loadscope-reorder --max-worker-restart 0 --durations 60 --durations-min 5
 

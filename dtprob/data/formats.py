@@ -1,6 +1,7 @@
 """Files to named arrays, whatever the format. No format that can run code is read."""
 
 import csv
+import re
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -13,6 +14,24 @@ from dtprob.errors import InputError
 type Arrays = dict[str, np.ndarray]
 
 _PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value")
+_TIME = re.compile(r"(\w+) since \d")
+_UNITS = {
+    "day": 86400,
+    "hour": 3600,
+    "minute": 60,
+    "second": 1,
+    "millisecond": 1e-3,
+    "microsecond": 1e-6,
+    "nanosecond": 1e-9,
+}
+_SHORT = {
+    "day": ("d",),
+    "hour": ("h", "hr"),
+    "minute": ("min",),
+    "second": ("", "sec"),
+    "millisecond": ("m", "msec"),
+}
+"""Other names of these units, an s at their end left out."""
 _NETCDF_DIMENSION_ONLY = b"This is a netCDF dimension but not a netCDF variable"
 
 
@@ -95,6 +114,39 @@ def _read_hdf5(path: Path) -> Arrays:
     return arrays
 
 
+def dimension_scales(path: Path) -> set[str]:
+    """Names of the arrays of a NetCDF or HDF5 file that only number the entries along a dimension; none of other files."""
+    import h5py  # noqa: PLC0415  (loaded only for this format)
+
+    if path.suffix.lower() not in {".nc", ".h5", ".hdf5"} or not h5py.is_hdf5(path):
+        return set()
+    with h5py.File(path, "r") as file:
+        told = {name for name, item in file.items() if _attribute(item, "CLASS") == b"DIMENSION_SCALE"}
+        return {name for name in told if _NETCDF_DIMENSION_ONLY not in _attribute(file[name], "NAME")}
+
+
+def _read_netcdf(path: Path) -> Arrays:
+    """NetCDF 4 is HDF5; the classic format, versions 1 and 2, is its own."""
+    with path.open("rb") as file:
+        is_classic = file.read(4) in {b"CDF\x01", b"CDF\x02"}
+    if not is_classic:
+        return _read_hdf5(path)
+    from scipy.io import netcdf_file  # noqa: PLC0415  (loaded only for this format)
+
+    arrays: Arrays = {}
+    with netcdf_file(path, mmap=False) as file:
+        for name, variable in file.variables.items():
+            array = np.array(variable[...])
+            if array.dtype.kind == "S":
+                words = array.reshape(-1, array.shape[-1]).tolist() if array.ndim else [[array.item()]]
+                text = [b"".join(word).rstrip(b"\x00").decode() for word in words]
+                arrays[name] = np.array(text, str).reshape(array.shape[:-1])
+                continue
+            attributes = {n: getattr(variable, n) for n in (*_PACKED, "units") if hasattr(variable, n)}
+            arrays[name] = _meant(array.astype(array.dtype.newbyteorder("=")), attributes)
+    return arrays
+
+
 def _attribute(item: Any, name: str) -> bytes:
     value = item.attrs.get(name, b"")
     return value.encode() if isinstance(value, str) else bytes(value)
@@ -110,7 +162,25 @@ def _meant(array: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray:
     absent = [array == told[name] for name in ("_FillValue", "missing_value") if name in told]
     if "scale_factor" in told or "add_offset" in told:
         array = array * float(told.get("scale_factor", 1.0)) + float(told.get("add_offset", 0.0))
+    array = array * _seconds(attributes)
     return np.where(np.any(absent, axis=0), np.nan, array) if np.any(absent) else array
+
+
+def _seconds(attributes: Mapping[str, Any]) -> float | int:
+    """Seconds in the unit of points in time, such as "hours since 2024-01-01"; 1 of anything else.
+
+    Raises:
+        InputError: a unit that has no length of its own, as a month.
+    """
+    units = attributes.get("units", "")
+    found = _TIME.match(units.decode() if isinstance(units, bytes) else str(units))
+    if found is None:
+        return 1
+    for unit, seconds in _UNITS.items():
+        if found[1].lower().rstrip("s") in {unit, *_SHORT.get(unit, ())}:
+            return seconds
+    got = f"{found[1]} since a date"
+    raise InputError("units of a point in time", f"one of {', '.join(_UNITS)}", got, "Write times as seconds")
 
 
 def _plain_complex(array: np.ndarray) -> np.ndarray:
@@ -206,7 +276,7 @@ FORMATS: Mapping[str, Callable[[Path], Arrays]] = {
     ".npz": _read_npz,
     ".h5": _read_hdf5,
     ".hdf5": _read_hdf5,
-    ".nc": _read_hdf5,
+    ".nc": _read_netcdf,
     ".zarr": _read_zarr,
     ".mat": _read_mat,
     ".csv": _read_csv,

@@ -4,13 +4,13 @@ import os
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 
 from dtprob.data import network, uwb_apartment
 from dtprob.data.arrays import ArraySpec, check_kind, side_by_side
-from dtprob.data.formats import Arrays, load_arrays
+from dtprob.data.formats import Arrays, dimension_scales, load_arrays
 from dtprob.data.kinds import (
     CHANNEL_ARRAYS,
     LABEL_ARRAYS,
@@ -22,6 +22,8 @@ from dtprob.data.kinds import (
     Table,
 )
 from dtprob.errors import InputError, unknown_name
+
+_CANONICAL: Final = {*CHANNEL_ARRAYS, *POWER_ARRAYS, "power_db", "power_reference"}
 
 
 def read(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None) -> Data:
@@ -45,6 +47,9 @@ def read(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None)
     if (path / uwb_apartment.RESPONSES).is_file():
         return uwb_apartment.channels(path, **_known(options or {}, ("links", "averages", "level"), path))
     arrays = load_arrays(path)
+    if {"channel", "power", "power_db"} & set(arrays):
+        for name in dimension_scales(path) - _CANONICAL:
+            del arrays[name]
     chosen = _known(options or {}, ("allow_gaps",) if _is_log(arrays) else (), path)
     try:
         return _interpret(arrays, chosen, matlab=_is_matlab(path))
@@ -61,16 +66,18 @@ def _known(options: Mapping[str, Any], valid: tuple[str, ...], path: Path) -> di
     return dict(options)
 
 
-def read_table(path: str | os.PathLike[str]) -> Table:
+def read_table(path: str | os.PathLike[str], options: Mapping[str, Any] | None = None) -> Table:
     """Read a file as columns or arrays by name, without asking what they mean.
 
     Args:
         path: a file of any format that ``read`` knows.
+        options: of the reader, of which there are none.
 
     Raises:
         InputError: as ``read``.
     """
     path = Path(path)
+    _known(options or {}, (), path)
     arrays = load_arrays(path)
     try:
         return Table(_columns(arrays, matlab=_is_matlab(path)))

@@ -175,7 +175,7 @@ def _arguments(
     elif needs_paths:
         data = _expected(read(file, case.data.options), ChannelData, file, case)
     else:
-        data = read_table(file)
+        data = read_table(file, case.data.options)
     if observed:  # designs may lack the columns that are
         named = data.arrays() if isinstance(data, Table) else ()
         check_words(f"{case.path.name} [data.words]", case.data.words, named)
@@ -228,7 +228,7 @@ def _arranged(case: Case, arrange: Callable[..., dict[str, Any]], data: Data) ->
         raise InputError(where, f"a key '{missing[0]}'", "none", f"Add {missing[0]} = ...")
     try:
         return arrange(data, **given)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         where = f"{case.path.name} [model.options]"
         raise InputError(where, "values of the right type", str(error), "Correct the options") from None
 

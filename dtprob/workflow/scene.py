@@ -31,6 +31,19 @@ _MOST_BEYOND = 64
 """Paths of another trace that are kept for each link where the case does not say."""
 _MOST_ELSEWHERE = 8
 """The same from another transmitter's place."""
+_OF_A_TRACE = (
+    *(
+        "max_depth",
+        "refraction",
+        "diffraction",
+        "diffuse_reflection",
+        "tx_pattern",
+        "rx_pattern",
+        "polarization",
+    ),
+    *("ceiling_height", "wall_material", "wall_thickness", "samples"),
+)
+"""Settings that only tracing takes."""
 
 
 def reached[Links: ChannelData | PowerData](
@@ -82,6 +95,7 @@ def paths_of(
     if scene.file.lower().endswith(".nc"):
         _check_needs_no_trace(scene, case)
         paths = _same_links(storage.load(scene.file), _placed(scene, data), case)
+        _check_traced(scene, paths, case, say)
         _check_tones(paths.frequency, data)
         return paths
     if scene.frequency is not None:
@@ -139,6 +153,20 @@ def _check_needs_no_trace(scene: SceneSection, case: Case) -> None:
     if asked:
         where = f"{case.path.name} [scene] {asked[0]}"
         raise InputError(where, "a scene to trace", Path(scene.file).name, "Name the scene, or leave it out")
+
+
+def _check_traced(scene: SceneSection, paths: PathSet, case: Case, say: Callable[[str], None]) -> None:
+    """Refuse another carrier than that of a path set, and say which settings of a trace it does without."""
+    if scene.frequency is not None and not np.isclose(scene.frequency, paths.frequency, rtol=1e-6):
+        expected, remedy = (
+            f"{paths.frequency:g} Hz, the carrier of {Path(scene.file).name}",
+            "Correct it, or leave it out",
+        )
+        raise InputError(f"{case.path.name} [scene] frequency", expected, f"{scene.frequency:g}", remedy)
+    fields = dataclasses.fields(scene)
+    given = [f.name for f in fields if f.name in _OF_A_TRACE and getattr(scene, f.name) != f.default]
+    if given:
+        say(f"note: {Path(scene.file).name} was traced before: [scene] {', '.join(given)} changes nothing")
 
 
 def _trace(scene: SceneSection, data: ChannelData | PowerData) -> PathSet:

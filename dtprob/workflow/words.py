@@ -42,11 +42,18 @@ def coded(file: Path, columns: Mapping[str, Any], words: Words, taken: Collectio
                 remedy = f"Leave {name} out of [data.words]"
                 raise InputError(f"{file.name}, column {name!r}", "words", "numbers", remedy)
             result[name] = _numbers(file, name, text, words[name])
+        elif is_text and name in taken and _has_commas(text):
+            remedy = "Write points in numbers, and leave out what separates thousands"
+            raise InputError(
+                f"{file.name}, column {name!r}", "numbers", f"words ({str(text[0])!r} first)", remedy
+            )
         elif is_text and name in taken and _are_names(text):
             found = sorted(set(text.tolist()))
             listed = ", ".join(f'"{word}"' for word in found)
             remedy = f"Number its words in the CASE: [data.words] {name} = [{listed}]"
-            raise InputError(f"{file.name}, column {name!r}", "numbers", f"words ({text[0]!r} first)", remedy)
+            raise InputError(
+                f"{file.name}, column {name!r}", "numbers", f"words ({str(text[0])!r} first)", remedy
+            )
     return result
 
 
@@ -97,6 +104,12 @@ def _numbers(file: Path, name: str, text: np.ndarray, listed: Sequence[str]) -> 
             expected = f"one of {', '.join(listed)}"
             raise InputError(f"{file.name}, column {name!r}, row {row}", expected, repr(word), remedy)
     return np.array([number[word] for word in text.tolist()])
+
+
+def _has_commas(text: np.ndarray) -> bool:
+    """Whether all words are numbers but for commas in them."""
+    words = set(text.reshape(-1).tolist())
+    return all(is_number(word.replace(",", "")) for word in words) and any("," in word for word in words)
 
 
 def _are_names(text: np.ndarray) -> bool:

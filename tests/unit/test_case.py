@@ -227,3 +227,14 @@ def test_what_own_modules_import_is_from_beside_the_same_case(tmp_path):
         (folder / "own_model_here.py").write_text("from own_helper_here import NAME\n")
         (folder / "own_helper_here.py").write_text(f"NAME = {name!r}\n")
         assert load_object("own_model_here:NAME", folder) == name
+
+
+def test_a_case_may_begin_with_a_mark_of_its_encoding_and_is_utf_8(tmp_path):
+    text = '# Straße\n[model]\nname = "a:b"\n[data]\nfile = "t.csv"\n'
+    for encoding in ("utf-8", "utf-8-sig"):
+        (tmp_path / "case.toml").write_text(text, encoding=encoding)
+        assert load_case(tmp_path / "case.toml").model.name == "a:b"
+    for encoding in ("cp1252", "utf-16"):
+        (tmp_path / "case.toml").write_text(text, encoding=encoding)
+        with pytest.raises(InputError, match=r"in UTF-8, got another encoding .* Save it as UTF-8"):
+            load_case(tmp_path / "case.toml")

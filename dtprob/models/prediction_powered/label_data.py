@@ -11,7 +11,7 @@ from jaxtyping import Float, Int
 from dtprob.data import Labels
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.prediction_powered.diagnostics import BiasMap, Region, bias_map, worth
-from dtprob.models.prediction_powered.estimate import estimate
+from dtprob.models.prediction_powered.estimate import Estimate, estimate
 from dtprob.models.prediction_powered.generalised import Calibration, posterior_data
 from dtprob.models.prediction_powered.losses import LOSSES, named_loss
 from dtprob.models.prediction_powered.predictors import JaxPredictor, Neighbours, Ridge
@@ -87,9 +87,17 @@ def label_data(
             probability=loss == "logistic",
         )
     found = estimate(chosen, sample, scheme, by=by, level=level)
-    for sentence in (*worth(found).warnings, *_biases(data, sample)):
+    for sentence in (*_worth(found), *_biases(data, sample)):
         warnings.warn(sentence, stacklevel=2)
     return posterior_data(chosen, sample, found, calibration=calibration)
+
+
+def _worth(found: Estimate) -> Generator[str]:
+    """What the predictions brought, in words; nothing where there are none."""
+    told = worth(found)
+    if found.scheme.name != "erm" and found.n_unlabelled and not told.warnings:
+        yield f"The predictions are worth {told.labels_gained:.0f} labels beside {found.n}, lambda {told.lam.value:.2f}."
+    yield from told.warnings
 
 
 def _split(

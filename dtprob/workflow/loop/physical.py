@@ -76,7 +76,7 @@ def _environment(case: TwinCase, *, allow_code: bool) -> Any:
         raise InputError(f"{case.path.name} [physical] environment", expected, name, "Correct the name")
     try:
         environment = make(**options)
-    except TypeError as error:
+    except (TypeError, ValueError) as error:
         where = f"{case.path.name} [physical.options]"
         raise InputError(where, f"what {name} takes", str(error), "Correct the options") from None
     if not hasattr(environment, "possible_agents") or not hasattr(environment, "step"):

@@ -508,3 +508,51 @@ def test_a_later_row_with_more_cells_is_refused(tmp_path):
         read_table(path)
     path.write_text('d,p\n1.5,-60.1,\n"2.5",-61\n\n')
     assert read_table(path).columns["p"].tolist() == [-60.1, -61.0]
+
+
+HOURS = np.datetime64("2024-01-01") + np.arange(6) * np.timedelta64(1, "h")
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
+def test_times_are_seconds_whatever_unit_they_were_stored_in(tmp_path, engine):
+    table = xr.Dataset(
+        {"time": ("row", HOURS), "level": ("row", np.arange(6.0)), "name": ("row", list("abcdef"))}
+    )
+    for units, origin in (("hours since 2024-01-01", 0.0), ("minutes since 2023-12-31", 86400.0)):
+        table.to_netcdf(tmp_path / "t.nc", engine=engine, encoding={"time": {"units": units}})
+        found = read_table(tmp_path / "t.nc").columns
+        np.testing.assert_array_equal(found["time"], origin + 3600.0 * np.arange(6))
+        np.testing.assert_array_equal(found["level"], np.arange(6.0))
+        assert found["name"].tolist() == list("abcdef")
+
+
+def test_a_unit_without_a_length_is_refused(tmp_path):
+    with h5py.File(tmp_path / "t.nc", "w") as file:
+        file["time"] = np.arange(3.0)
+        file["time"].attrs["units"] = "months since 2024-01-01"
+    with pytest.raises(InputError, match=r"got months since a date\. Write times as seconds"):
+        read_table(tmp_path / "t.nc")
+
+
+@pytest.mark.parametrize("engine", ["h5netcdf", "scipy"])
+def test_powers_may_have_coordinates_of_their_dimensions(tmp_path, engine):
+    arrays = power_arrays()
+    axes = {
+        "power": ("link", "snapshot", "subcarrier"),
+        "rx_position": ("link", "xyz"),
+        "tx_position": ("link", "xyz"),
+    }
+    coords = {"link": np.arange(3), "snapshot": [0.0], "xyz": list("xyz")}
+    whole = xr.Dataset({name: (axes[name], value) for name, value in arrays.items()}, coords)
+    whole.to_netcdf(tmp_path / "p.nc", engine=engine)
+    if engine == "scipy":
+        whole.drop_vars(list(coords)).to_netcdf(tmp_path / "p.nc", engine=engine)
+    found = read(tmp_path / "p.nc")
+    assert isinstance(found, PowerData)
+    np.testing.assert_array_equal(found.power, arrays["power"])
+
+
+def test_a_table_takes_no_options(tmp_path):
+    (tmp_path / "t.csv").write_text("a,b\n1,2\n3,4\n")
+    with pytest.raises(InputError, match=r"options of t.csv: expected none, got separator"):
+        read_table(tmp_path / "t.csv", {"separator": ";"})

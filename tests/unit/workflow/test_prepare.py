@@ -257,3 +257,32 @@ def test_a_ray_traced_model_needs_a_scene(folder):
     (folder / "case.toml").write_text(text[:start] + text[end:])
     with pytest.raises(InputError, match=r"expected a section \[scene\] for ray_traced_channel, got none"):
         prepare(load_case(folder / "case.toml"), need="fit")
+
+
+def test_a_scene_that_was_traced_at_another_carrier_is_refused(folder):
+    change(folder, "frequency = 6000000000.0", "frequency = 6000.0")
+    with pytest.raises(
+        InputError, match=r"\[scene\] frequency: expected 6e\+09 Hz, the carrier of paths.nc, got 6000"
+    ):
+        prepare(load_case(folder / "case.toml"), need="fit")
+
+
+def test_settings_that_a_traced_scene_does_without_are_told(folder):
+    change(folder, "max_depth = 3", 'max_depth = 9\nrefraction = true\npolarization = "H"')
+    said = []
+    prepare(load_case(folder / "case.toml"), need="fit", say=said.append)
+    note = "note: paths.nc was traced before: [scene] max_depth, refraction, polarization changes nothing"
+    assert note in said
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [('materials = "per_objects"', "Did you mean 'per_object'"), ('phase = "Coherent"', "one of")],
+)
+def test_a_misspelt_option_is_no_other_model(folder, options, said):
+    change(folder, "[data]", f"[model.options]\n{options}\n[data]")
+    if options.startswith("phase"):
+        change(folder, 'phase = "coherent"\n', "")
+    prepared = prepare(load_case(folder / "case.toml"), need="fit")
+    with pytest.raises(InputError, match=said):
+        handlers.seed(prepared.model, 0)(**prepared.data)

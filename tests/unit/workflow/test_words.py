@@ -169,3 +169,10 @@ def test_a_diagnosis_speaks_of_words(tmp_path):
     page = (out / "report.html").read_text()
     assert "site tower" in page
     assert page.count("harbour") > 1  # the places of the picture along the column
+
+
+@pytest.mark.parametrize("cells", [('"-71,5"', '"-70,5"'), ('"1,100"', '"1,200"')])
+def test_numbers_with_commas_are_no_words(tmp_path, cells):
+    rows = "\n".join(f"{10.0 + i},{SITES[i % 3]},{cells[i % 2]}" for i in range(30))
+    with pytest.raises(InputError, match=r"got words \('.*' first\)\. Write points in numbers"):
+        prepare(case(tmp_path, rows, WORDS), need="fit")
