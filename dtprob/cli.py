@@ -31,6 +31,12 @@ COMMANDS = {
 }
 """For each command, the module whose `run`, or the function of the subcommand's name, does it."""
 
+_GOES_ON = "Continue with the same command and --resume."
+_RESUMED = {
+    "diagnose": "With --resume the same command takes what was traced and learned from reference data, and begins anew."
+}
+"""What --resume does after a command was stopped, where it does not go on from there."""
+
 
 class Parser(argparse.ArgumentParser):
     """Answers a mistake with one line that says what to do; `--debug` goes wherever `--help` does."""
@@ -171,7 +177,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             read_document(options["twin_case"])
         getattr(importlib.import_module(COMMANDS[command]), step)(**options)
     except KeyboardInterrupt:
-        resume = " Continue with the same command and --resume." if "resume" in options else ""
+        resume = f" {_RESUMED.get(command, _GOES_ON)}" if "resume" in options else ""
         return _fail(INTERRUPTED, f"stopped.{resume}", debug=debug)
     except BrokenPipeError:
         unread()

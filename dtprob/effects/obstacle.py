@@ -110,7 +110,7 @@ def _crossings(paths: PathSet, start: np.ndarray, stop: np.ndarray) -> jax.Array
 
 def _name(start: np.ndarray, stop: np.ndarray) -> str:
     """The ends in m, with as many digits as tell this screen from the next one."""
-    digits = max(1, math.ceil(-math.log10(float(np.abs(stop - start).max()))) + 1)
+    digits = max(1, math.ceil(-math.log10(float(np.abs(stop - start).max()) / 4)))
     ends = [f"{round(float(v), digits) + 0.0:g}" for v in (*start, *stop)]
     return f"{ends[0]}_{ends[1]}_to_{ends[2]}_{ends[3]}"
 

@@ -61,6 +61,11 @@ class SiteFinding:
         return "ripple" in self.family
 
     @property
+    def is_inline(self) -> bool:
+        """Whether it is of readings themselves, which no site stands for one by one; a site that shows it says more."""
+        return self.family.startswith("location")
+
+    @property
     def can_be_modelled(self) -> bool:
         """Whether a model of the remainder may say something: not of what nothing moves, nor of ripples that follow it."""
         return self.gain is not None and (self.is_of_values or not (self.last and self.is_ripple))
@@ -104,6 +109,8 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
 
     Ripples of a spread come last where tails are what is wrong: the finest ones find any reading that is far off.
 
+    Readings themselves come last where a site stands for some of them, unless they are more than twice as surely wrong.
+
     Where p-values end values come last if their scores are no larger than noise of such an energy (of the residuals, over
     its expectation) makes them.
     """
@@ -111,12 +118,14 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
     of_moments = min((f.p_value for f in findings if not f.is_of_values), default=1.0)
     score = max((f.score for f in findings if f.is_of_values), default=0.0)
     by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
+    of_sites = min((f.p_value for f in findings if f.is_of_values and not f.is_inline), default=1.0)
     strays = any(f.moment == "tails" and f.p_value <= _FAR_READINGS for f in findings)
     return [
         replace(
             f,
             last=(of_values <= SURE and f.is_of_values == by_noise and not f.repeats)
-            or (strays and f.is_ripple and not f.is_of_values),
+            or (strays and f.is_ripple and not f.is_of_values)
+            or (f.is_inline and of_sites <= SURE and f.p_value >= of_sites**2),
         )
         for f in findings
     ]

@@ -76,3 +76,22 @@ def test_a_law_is_found_whatever_else_is_named(named):
     assert "height" in site["family"]
     (note,) = (text for text in found.sections["fit"]["warnings"] if "stands for the values of y" in text)
     assert note.endswith("what numpyro.deterministic returns")
+
+
+def per_device(y=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 5.0))
+    with numpyro.plate("device", 12, dim=-2):
+        of_device = numpyro.deterministic("of_device", level + jnp.zeros((12, 1)))
+        with numpyro.plate("reading", 20, dim=-1):
+            numpyro.sample("y", dist.Normal(of_device, 1.0), obs=y)
+
+
+@pytest.mark.parametrize(("wrong", "site"), [("a device", "of_device"), ("a drift", "y")])
+def test_a_site_that_shows_it_as_well_is_named_before_the_readings(wrong, site):
+    rng = np.random.default_rng(3)
+    shift = 3.0 * (np.arange(12) == 4)[:, None] if wrong == "a device" else 1.5 * np.linspace(-1, 1, 20)
+    given = {"y": jnp.asarray(rng.normal(size=(12, 20)) + shift)}
+    settings = Settings(replicates=100, site_replicates=50)
+    found = diagnose(per_device, given, [], key=jax.random.key(0), engine=Laplace(), settings=settings)
+    assert found.verdict == "UNLISTED"
+    assert found.sections["where"]["sites"][0]["site"] == site
