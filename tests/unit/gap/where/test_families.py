@@ -9,6 +9,7 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
+from dtprob.gap.model.inline import unnamed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.along import curves
 from dtprob.gap.where.curves import Curves, cycles, grouped
@@ -395,7 +396,7 @@ def test_short_axes_have_no_curves(problem):
 
 def test_the_spread_of_an_observation_is_a_site(problem):
     x = problem.null()
-    sites = list(observed(problem, problem.compiled.residual(x)[None]))
+    sites = list(observed(problem, problem.compiled.residual(x)[None], ()))
     assert [(s.name, list(s.kinds)) for s in sites] == [("y", ["spread"])]
     y = np.asarray(problem.data["y"])
     np.testing.assert_allclose(sites[0].gradients[0], (y**2 - 1) / np.sqrt(2), rtol=1e-5)
@@ -406,7 +407,9 @@ def test_the_spread_of_an_observation_is_a_site(problem):
 
 def test_where_no_site_is_named_the_observations_locations_are_tested():
     problem = Problem(raw, {n: rows()[n] for n in ("x", "y")}, [], "row")
-    sites = list(observed(problem, problem.compiled.residual(problem.null())[None]))
+    own = unnamed(problem, problem.null())
+    assert own == {"y"}
+    sites = list(observed(problem, problem.compiled.residual(problem.null())[None], own))
     assert [list(s.kinds) for s in sites] == [["location"], ["spread"]]
     y = np.asarray(problem.data["y"])
     np.testing.assert_allclose(sites[0].gradients[0], y, rtol=1e-5)
