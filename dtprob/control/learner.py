@@ -83,15 +83,14 @@ def train(
         budget: how much is played.
 
     Raises:
-        InputError: a budget without an environment, or with too few slots between two updates to learn from; a policy or a
-            learner of other devices, buffers or frames.
+        InputError: a budget without an environment, or with too few slots between two updates to learn from; a policy of
+            other devices, or one or a learner of smaller buffers.
     """
     warn_of_miscompilation()
     for name, value, least in (("environments", budget.environments, 1), ("length", budget.length, 2)):
         if value < least:
             raise InputError(f"budget: {name}", f"{least} or more", str(value), "Give a larger number")
     check_size(environment.kernel, learner)
-    check_size(policy, learner)
     first, second, third = jax.random.split(key, 3)
     kept = learner.start(first, policy)
     now = begin(second, environment, policy, budget.environments)

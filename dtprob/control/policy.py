@@ -169,7 +169,7 @@ def aloha(devices: int, capacity: int, probability: float) -> TablePolicy:
     Raises:
         InputError: a probability outside of [0, 1].
     """
-    if not 0 <= probability <= 1:
+    if isinstance(probability, int | float) and not 0 <= probability <= 1:
         raise InputError("probability of aloha", "a number from 0 to 1", f"{probability:g}", "Correct it")
     return TablePolicy(jnp.full((1, devices, capacity + 1, 2, 2), probability))
 
@@ -180,7 +180,7 @@ def tabulate(policy: FramePolicy) -> TablePolicy:
 
 
 def check_size(whole: Any, part: Any) -> None:
-    """Refuse a policy or learner of other devices, buffers or frames than what it is used with: indices would be clamped.
+    """Refuse a policy or learner of other devices or smaller buffers than what it is used with: indices would be clamped.
 
     Args:
         whole: a kernel or a policy.
@@ -189,13 +189,16 @@ def check_size(whole: Any, part: Any) -> None:
     Raises:
         InputError: the first difference.
     """
-    for name in ("devices", "capacity", "frame"):
-        expected, got = getattr(whole, name, None), getattr(part, name, None)
-        if expected is not None and got is not None and expected != got:
-            what = f"{name} of {type(part).__name__}"
-            raise InputError(
-                what, f"{expected}, as in {type(whole).__name__}", str(got), "Make it with the same"
-            )
+    devices, capacity = (
+        (getattr(whole, name, None), getattr(part, name, None)) for name in ("devices", "capacity")
+    )
+    for name, (expected, got), least in (("devices", devices, ""), ("capacity", capacity, " or more")):
+        if expected is None or got is None or got == expected or (least and got > expected):
+            continue
+        what = f"{name} of {type(part).__name__}"
+        raise InputError(
+            what, f"{expected}{least}, as in {type(whole).__name__}", str(got), "Make it with as many"
+        )
 
 
 def unroll(

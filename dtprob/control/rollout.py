@@ -74,7 +74,7 @@ def begin(key: PRNGKeyArray, environment: Environment, policy: Policy, count: in
     """Start episodes in `count` environments.
 
     Raises:
-        InputError: a policy of other devices or buffers.
+        InputError: a policy of other devices or smaller buffers.
     """
     check_size(environment.kernel, policy)
     keys = jax.random.split(key, count)

@@ -118,18 +118,26 @@ def dimension_scales(path: Path) -> set[str]:
     """Names of the arrays of a NetCDF or HDF5 file that only number the entries along a dimension; none of other files."""
     import h5py  # noqa: PLC0415  (loaded only for this format)
 
-    if path.suffix.lower() not in {".nc", ".h5", ".hdf5"} or not h5py.is_hdf5(path):
+    if path.suffix.lower() not in {".nc", ".h5", ".hdf5"}:
         return set()
+    if _is_classic(path):
+        from scipy.io import netcdf_file  # noqa: PLC0415  (loaded only for this format)
+
+        with netcdf_file(path, mmap=False) as file:
+            return {name for name, variable in file.variables.items() if name in variable.dimensions}
     with h5py.File(path, "r") as file:
         told = {name for name, item in file.items() if _attribute(item, "CLASS") == b"DIMENSION_SCALE"}
         return {name for name in told if _NETCDF_DIMENSION_ONLY not in _attribute(file[name], "NAME")}
 
 
-def _read_netcdf(path: Path) -> Arrays:
-    """NetCDF 4 is HDF5; the classic format, versions 1 and 2, is its own."""
+def _is_classic(path: Path) -> bool:
+    """Whether a file is of NetCDF's own format, version 1 or 2; version 4 is HDF5."""
     with path.open("rb") as file:
-        is_classic = file.read(4) in {b"CDF\x01", b"CDF\x02"}
-    if not is_classic:
+        return file.read(4) in {b"CDF\x01", b"CDF\x02"}
+
+
+def _read_netcdf(path: Path) -> Arrays:
+    if not _is_classic(path):
         return _read_hdf5(path)
     from scipy.io import netcdf_file  # noqa: PLC0415  (loaded only for this format)
 
@@ -162,7 +170,8 @@ def _meant(array: np.ndarray, attributes: Mapping[str, Any]) -> np.ndarray:
     absent = [array == told[name] for name in ("_FillValue", "missing_value") if name in told]
     if "scale_factor" in told or "add_offset" in told:
         array = array * float(told.get("scale_factor", 1.0)) + float(told.get("add_offset", 0.0))
-    array = array * _seconds(attributes)
+    seconds = _seconds(attributes)
+    array = array if seconds == 1 else array.astype(float) * seconds
     return np.where(np.any(absent, axis=0), np.nan, array) if np.any(absent) else array
 
 
@@ -170,17 +179,20 @@ def _seconds(attributes: Mapping[str, Any]) -> float | int:
     """Seconds in the unit of points in time, such as "hours since 2024-01-01"; 1 of anything else.
 
     Raises:
-        InputError: a unit that has no length of its own, as a month.
+        InputError: months or years, which have no length of their own.
     """
     units = attributes.get("units", "")
     found = _TIME.match(units.decode() if isinstance(units, bytes) else str(units))
     if found is None:
         return 1
-    for unit, seconds in _UNITS.items():
-        if found[1].lower().rstrip("s") in {unit, *_SHORT.get(unit, ())}:
-            return seconds
-    got = f"{found[1]} since a date"
-    raise InputError("units of a point in time", f"one of {', '.join(_UNITS)}", got, "Write times as seconds")
+    word = found[1].lower().rstrip("s")
+    if word in {"month", "year"}:
+        got = f"{found[1]} since a date"
+        raise InputError(
+            "units of a point in time", f"one of {', '.join(_UNITS)}", got, "Write times as seconds"
+        )
+    known = (seconds for unit, seconds in _UNITS.items() if word in {unit, *_SHORT.get(unit, ())})
+    return next(known, 1)
 
 
 def _plain_complex(array: np.ndarray) -> np.ndarray:

@@ -220,6 +220,8 @@ def _chosen(known: Sequence[Link], links: Sequence[int] | None, averages: int, l
     if missing or not asked:
         expected = f"a list of numbers among {', '.join(map(str, sorted(numbers)))}"
         raise InputError(f"{NAME} links", expected, str(missing), "Name links that exist")
+    if len(set(asked)) < len(asked):
+        raise InputError(f"{NAME} links", "different numbers", str(list(asked)), "Name each link once")
     of_number = {link.number: link for link in known}
     chosen = [of_number[number] for number in asked]
     fewest = min(chosen, key=lambda link: len(link.impulse_response))

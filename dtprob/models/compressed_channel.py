@@ -118,7 +118,7 @@ def compressed_channel(
     amplitude = gain[:, None] * jax.lax.complex(jnp.cos(angle), jnp.sin(angle))
     amplitude = jnp.broadcast_to(amplitude, (links, snapshots, paths.n_path))
     mean = jnp.einsum("lcp,lsp->lsc", mixing, amplitude)
-    noise = unknown_noise_power(noise_power, paths).reshape(-1, 1, 1)
+    noise = site("noise_power", unknown_noise_power(noise_power, paths)).reshape(-1, 1, 1)
     rank = jnp.sum(kept, axis=1)[:, None]
     of_link, of_snapshot = numpyro.plate("link", links, dim=-3), numpyro.plate("snapshot", snapshots, dim=-2)
     free = jnp.broadcast_to(size - rank, residual.shape)[..., None]

@@ -15,7 +15,7 @@ from numpyro.infer.util import compute_log_probs
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, split_static
-from dtprob.models.declaration import declare
+from dtprob.models.declaration import Declaration, declare
 from dtprob.xla import warn_of_miscompilation
 
 type Likelihoods = dict[str, Float[np.ndarray, "draw window"]]
@@ -42,7 +42,7 @@ def window_likelihoods(
 
     Raises:
         InputError: draws of a latent site are missing, an observed site has no such window, a window's likelihood is not a
-            number, or the model adds to it by `numpyro.factor`, which belongs to no window.
+            number, or the model adds to it by a `numpyro.factor` of the data, which belongs to no window.
     """
     warn_of_miscompilation()
     declaration = declare(model, data)
@@ -50,10 +50,7 @@ def window_likelihoods(
     if missing:
         remedy = "Sample them from a posterior of this model"
         raise InputError("draws", f"every latent site of {declaration.name}", f"no {missing[0]!r}", remedy)
-    if declaration.factors:
-        remedy = "Observe a distribution instead, or watch by a model that does"
-        expected, got = "all that data tell at observed sites", f"numpyro.factor {declaration.factors[0]!r}"
-        raise InputError(f"windows of {declaration.name}", expected, got, remedy)
+    _check_factors(model, data, draws, declaration)
     axis = window or declaration.cluster
     axes = {name: site.axes for name, site in declaration.observed.items()}
     for name, own in axes.items():
@@ -73,6 +70,27 @@ def window_likelihoods(
                 f"log likelihood of {label}", expected, got, "Correct the reading there, or mask it"
             )
     return told
+
+
+def _check_factors(model: Model, data: Data, draws: Mapping[str, Any], declaration: Declaration) -> None:
+    """Refuse a `numpyro.factor` of the data, which is of no window; one of unknowns alone is a prior."""
+    if not declaration.factors:
+        return
+    first = {name: jnp.asarray(draws[name])[0] for name in declaration.latent}
+    fixed = handlers.substitute(handlers.seed(model, jax.random.key(0)), data=first)
+    arrays, static = split_static(data)
+    told = []
+    for times in (1.0, 1.5):
+        moved = jax.tree.map(
+            lambda x, times=times: x * times if jnp.issubdtype(x.dtype, jnp.inexact) else x, arrays
+        )
+        terms, _ = compute_log_probs(fixed, (), dict(eqx.combine(moved, static)), {})
+        told.append({name: float(terms[name]) for name in declaration.factors})
+    for name in declaration.factors:
+        if told[0][name] != told[1][name]:
+            remedy = "Observe a distribution instead, or watch by a model that does"
+            expected, got = "all that data tell at observed sites", f"numpyro.factor {name!r} of them"
+            raise InputError(f"windows of {declaration.name}", expected, got, remedy)
 
 
 @eqx.filter_jit

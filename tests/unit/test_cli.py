@@ -371,6 +371,7 @@ def test_a_demo_overwrites_nothing(capsys, tmp_path):
     assert main(["demo", "--out", str(tmp_path)]) == 2
     assert "got another file" in capsys.readouterr().err
     assert {file.name for file in (tmp_path / "case").iterdir()} == {"case.toml"}
+    assert (tmp_path / "case" / "case.toml").read_text() == "# mine"
 
 
 def test_out_that_cannot_be_written_to_is_said_before_any_work(case, capsys):

@@ -15,8 +15,8 @@ from dtprob.gap.fitting.newton import positive
 from dtprob.gap.model.layout import Block
 from dtprob.gap.model.problem import Problem
 
-_FEWEST: Final = 0.5
-"""Entries that count as determined at least."""
+_FEWEST: Final = 2.0
+"""Entries that count as determined at least: of one a spread of any size is told, but for its prior."""
 _TAILS: Final = np.array([0.05, 0.95])
 """Probabilities above the quantiles that bound a 90% interval."""
 

@@ -154,12 +154,10 @@ def notes(problem: Problem, fitted: Fit) -> tuple[str, ...]:
 
 
 def _inline(problem: Problem, fitted: Fit) -> list[str]:
-    """Observations for whose values no site stands, though the model names some."""
-    names = sorted(unnamed(problem, fitted.x)) if problem.float_sites else []
+    """Observations whose values no site moves, though the model names some."""
+    names = sorted(unnamed(problem, fitted.x, np.inf)) if problem.float_sites else []
     remedy = "where one is named, let the model go on with what numpyro.deterministic returns"
-    return (
-        [f"no site that the model names stands for the values of {_listed(names)}: {remedy}"] if names else []
-    )
+    return [f"no site that the model names moves the values of {_listed(names)}: {remedy}"] if names else []
 
 
 def _contradicted(problem: Problem, fitted: Fit) -> list[str]:

@@ -15,7 +15,7 @@ _ALIKE: Final = 8
 """Values that one entry of a site may stand for, as it does for repeated readings."""
 
 
-def unnamed(problem: Problem, x: Float[np.ndarray, " dimension"]) -> frozenset[str]:
+def unnamed(problem: Problem, x: Float[np.ndarray, " dimension"], alike: float = _ALIKE) -> frozenset[str]:
     """Observed sites whose values no deterministic site moves that has an entry for each of them, or for a few.
 
     A site that is named and not used, one of spreads, or a level of many readings leaves the readings' own values unlooked
@@ -24,11 +24,12 @@ def unnamed(problem: Problem, x: Float[np.ndarray, " dimension"]) -> frozenset[s
     Args:
         problem: the model on its data.
         x: where it is looked at.
+        alike: how many values one entry of a site may stand for.
     """
     observed, random = problem.declaration.observed, np.random.default_rng(_SEED)
     left = set(observed)
     for name, site in reversed(problem.float_sites.items()):
-        enough = {n for n in left if site.size * _ALIKE >= observed[n].size}
+        enough = {n for n in left if site.size * alike >= observed[n].size}
         if not enough:
             continue
         step = random.normal(size=(1, *site.shape)).astype(site.dtype)

@@ -148,18 +148,17 @@ def normal_of(draws: Mapping[str, np.ndarray]) -> Known:
     """
     result: Known = {}
     for names in _groups(draws):
-        u = np.unique(
-            np.concatenate([draws[name] for name in names], axis=1), axis=0
-        )  # a sampler may repeat itself
-        n, d = u.shape
-        if 1 < n < _DRAWS_OF_EACH * d:
-            expected = f"{_DRAWS_OF_EACH * d} different draws or more, for {d} unknowns that hang together"
+        u = np.concatenate([draws[name] for name in names], axis=1)
+        n, d = len(np.unique(u, axis=0)), u.shape[1]  # what is drawn again weighs more, and tells no more
+        least = max(_DRAWS_OF_EACH * d, d + 3)
+        if 1 < n < least:
+            expected = f"{least} different draws or more, for {d} unknowns that hang together"
             raise InputError(f"reference, {', '.join(names)}", expected, str(n), "Let its engine draw more")
         size = np.mean(u**2, axis=0)
         floor = 1e-10 * np.where(size > 0, size, 1.0)  # in the unit of each entry
-        covariance = np.cov(u.T).reshape(d, d) if n > 1 else np.zeros((d, d))
-        share = (n - d - 2) / (n - 1) if n > d + 2 else 1.0
-        result[names] = (u.mean(0), share * np.linalg.inv(covariance + np.diag(floor)))
+        share = (n - d - 2) / (n - 1) if n > 1 else 1.0
+        precision = np.linalg.inv(np.cov(u.T).reshape(d, d) + np.diag(floor))
+        result[names] = (u.mean(0), share * precision)
     return result
 
 

@@ -14,7 +14,7 @@ from dtprob.effects.redrawn import DRAWN
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.layout import transform_of
 from dtprob.gap.model.quick import quick_jit
-from dtprob.inference.posterior import Sampler
+from dtprob.inference.posterior import Posterior, Sampler
 
 
 @final
@@ -55,7 +55,9 @@ class Prior:
     def reference_draws(
         self, reference: Sampler, names: list[str], n: int, arrays: Any
     ) -> dict[str, np.ndarray]:
-        """Unconstrained draws (n, size) of those of some sites that a reference knows."""
+        """Unconstrained draws (n, size) of those of some sites that a reference knows, no more than a posterior has."""
+        if isinstance(reference, Posterior):
+            n = min(n, max(reference.chains * reference.draws_per_chain, 2))
         draws = reference.sample(jax.random.key(0), n)
         called = {name: name if name in draws else name.removesuffix(DRAWN) for name in names}
         chosen = {name: jnp.asarray(draws[own]) for name, own in called.items() if own in draws}

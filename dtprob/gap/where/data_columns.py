@@ -20,18 +20,23 @@ _MOST: Final = 32
 def check_finite(problem: Problem) -> None:
     """Refuse columns with missing values beside readings that count: nothing could be looked for along them.
 
+    One that is whole beside the readings of one observed site may have gaps beside those of another.
+
     Raises:
         InputError: the first such column.
     """
+    lost: dict[str, list[np.ndarray]] = {}
     for name, site in problem.declaration.observed.items():
         counts = problem.observed.counted[name]
         for column, missing in all_columns(problem, site, missing=True).items():
-            lost = counts & np.broadcast_to(missing, site.shape)
-            if lost.any():
-                first = ", ".join(str(int(k)) for k in np.argwhere(lost)[0])
-                got = f"{int(lost.sum())} that are not, the first at [{first}]"
-                remedy = "Fill them, leave those readings out, or give the model no such column"
-                raise InputError(f"data {column}", "finite numbers beside each reading", got, remedy)
+            lost.setdefault(column, []).append(counts & np.broadcast_to(missing, site.shape))
+    for column, of_each in lost.items():
+        if all(gaps.any() for gaps in of_each):
+            gaps = of_each[0]
+            first = ", ".join(str(int(k)) for k in np.argwhere(gaps)[0])
+            got = f"{int(gaps.sum())} that are not, the first at [{first}]"
+            remedy = "Fill them, leave those readings out, or give the model no such column"
+            raise InputError(f"data {column}", "finite numbers beside each reading", got, remedy)
 
 
 def columns(problem: Problem, axis: str, size: int, *, missing: bool = False) -> dict[str, np.ndarray]:
@@ -55,7 +60,7 @@ def columns(problem: Problem, axis: str, size: int, *, missing: bool = False) ->
     return {
         name: column
         for name, column in found.items()
-        if any(np.issubdtype(column.dtype, kind) for kind in real) and len(np.unique(column)) > 1
+        if any(np.issubdtype(column.dtype, kind) for kind in real) and (missing or len(np.unique(column)) > 1)
     }
 
 
@@ -95,20 +100,18 @@ def _is_within(shape: tuple[int, ...], wide: tuple[int, ...]) -> bool:
 def _given(problem: Problem, *, missing: bool) -> Iterator[tuple[str, np.ndarray]]:
     """The arrays of the data, but for what tells what was observed; or where they are not finite.
 
-    What is missing is as the others are on average: only beside readings that do not count may anything be.
+    What is missing is as the others of its column are on average: only beside readings that do not count may anything be.
     """
     for name, values in problem.data.items():
         if name not in problem.observed.arguments and eqx.is_array_like(values):
             array = np.asarray(values)
-            lost = (
-                ~np.isfinite(array) if np.issubdtype(array.dtype, np.inexact) else np.zeros(array.shape, bool)
-            )
-            if missing:
-                yield name, lost
-            else:
-                yield (
-                    name,
-                    np.where(lost, array[~lost].mean() if not lost.all() else 0.0, array)
-                    if lost.any()
-                    else array,
-                )
+            is_real = np.issubdtype(array.dtype, np.inexact)
+            lost = ~np.isfinite(array) if is_real else np.zeros(array.shape, bool)
+            yield name, lost if missing else _filled(array, lost)
+
+
+def _filled(array: np.ndarray, lost: np.ndarray) -> np.ndarray:
+    if not lost.any():
+        return array
+    known = np.where(lost, 0.0, array)
+    return np.where(lost, known.sum(axis=0) / np.maximum((~lost).sum(axis=0), 1), array)

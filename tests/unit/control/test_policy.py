@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from dtprob.control import (
-    COMA,
     IPPO,
     Budget,
     FramePolicy,
@@ -173,21 +172,25 @@ def test_a_chance_is_between_zero_and_one(probability):
         random_access(4, probability)
 
 
+def test_chances_may_be_swept():
+    swept = jax.vmap(lambda p: aloha(4, 1, p).probability.mean())(jnp.array([0.1, 0.5]))
+    np.testing.assert_allclose(swept, [0.1, 0.5])
+
+
 def test_what_is_of_another_size_is_refused_and_not_clamped():
     network = world(NETWORK)
     devices, capacity = NETWORK_KERNEL.devices, NETWORK_KERNEL.capacity
     for policy, what in (
-        (FramePolicy(KEY, devices, capacity=capacity + 1), "capacity of FramePolicy"),
-        (aloha(devices, capacity + 2, 0.5), "capacity of TablePolicy"),
+        (FramePolicy(KEY, devices, capacity=capacity - 1), "capacity of FramePolicy"),
+        (aloha(devices, capacity - 1, 0.5), "capacity of TablePolicy"),
         (HistoryPolicy(KEY, devices + 1), "devices of HistoryPolicy"),
     ):
         with pytest.raises(InputError, match=what):
             evaluate(KEY, network, policy, 10, 2)
-    budget = Budget(8, environments=2, length=4)
-    with pytest.raises(InputError, match="frame of COMA: expected 8, as in FramePolicy, got 4"):
-        train(KEY, COMA(), FramePolicy(KEY, devices, frame=8, capacity=capacity), network, budget)
+    assert evaluate(KEY, network, aloha(devices, capacity + 2, 0.5), 10, 2).reward.shape == (2,)
+    policy = FramePolicy(KEY, devices, capacity=capacity)
     with pytest.raises(InputError, match="capacity of IPPO"):
-        train(KEY, IPPO(capacity=capacity + 1), FramePolicy(KEY, devices, capacity=capacity), network, budget)
+        train(KEY, IPPO(capacity=capacity - 1), policy, network, Budget(8, environments=2, length=4))
 
 
 def test_a_policy_without_memory_foresees_what_it_reaches():

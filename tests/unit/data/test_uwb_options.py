@@ -23,6 +23,7 @@ def two_links(monkeypatch):
     [
         ({"links": 4}, "links: expected a list of numbers among 4, 9, got 4"),
         ({"links": [4, 5]}, r"numbers among 4, 9, got \[5\]"),
+        ({"links": [4, 4]}, r"expected different numbers, got \[4, 4\]"),
         ({"links": []}, "links: expected a list"),
         ({"averages": 2.5}, "averages: expected 2 or more, got 2.5"),
         ({"averages": 4}, "averages: expected at most 3, the packets of link 4, got 4"),

@@ -57,6 +57,15 @@ def test_a_column_with_a_missing_value_is_refused_by_name_though_the_model_does_
     assert told(two_sensors, **sensors(height=height, seen=seen, other_seen=seen)).verdict == "NO_GAP"
 
 
+def test_a_column_may_have_gaps_beside_the_readings_of_one_sensor():
+    """It is the other's, which sent nothing there."""
+    sent = np.arange(ROWS) % 4 > 0
+    height = np.where(sent, np.random.default_rng(1).normal(size=ROWS), np.nan)
+    assert told(two_sensors, **sensors(height=height, other_seen=sent)).verdict == "NO_GAP"
+    with pytest.raises(InputError, match="data height"):
+        told(two_sensors, **sensors(height=np.full(ROWS, np.nan)))
+
+
 def test_a_sensor_that_is_absent_hinders_nothing():
     assert told(two_sensors, **sensors(other_seen=np.zeros(ROWS, bool))).verdict == "NO_GAP"
 

@@ -102,9 +102,9 @@ def readings(y=None):
         numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
 
 
-def with_a_factor(y=None):
+def with_a_factor(y=None, *, of_data=True):
     readings(y)
-    numpyro.factor("more", -1.0)
+    numpyro.factor("more", -jnp.sum(y**2) if of_data and y is not None else -1.0)
 
 
 def test_a_reading_that_is_no_number_is_told_and_not_taken_for_a_change():
@@ -122,7 +122,10 @@ def test_a_reading_that_is_no_number_is_told_and_not_taken_for_a_change():
 
 def test_what_belongs_to_no_window_is_refused():
     with pytest.raises(InputError, match=r"got numpyro\.factor 'more'"):
-        window_likelihoods(with_a_factor, {"y": jnp.zeros((200, 4))}, {"level": np.zeros(2)})
+        window_likelihoods(with_a_factor, {"y": jnp.ones((200, 4))}, {"level": np.zeros(2)})
+    given = {"y": jnp.ones((200, 4)), "of_data": False}
+    found = window_likelihoods(with_a_factor, given, {"level": np.zeros(2)})
+    np.testing.assert_allclose(found["y"], 4 * -0.5 * (1 + np.log(2 * np.pi)))
 
 
 def test_normal_windows_that_cannot_be_are_no_threshold():

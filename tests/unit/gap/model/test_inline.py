@@ -74,7 +74,7 @@ def test_a_law_is_found_whatever_else_is_named(named):
     site = found.sections["where"]["sites"][0]
     assert site["site"] == "y"
     assert "height" in site["family"]
-    (note,) = (text for text in found.sections["fit"]["warnings"] if "stands for the values of y" in text)
+    (note,) = (text for text in found.sections["fit"]["warnings"] if "moves the values of y" in text)
     assert note.endswith("what numpyro.deterministic returns")
 
 
@@ -95,3 +95,4 @@ def test_a_site_that_shows_it_as_well_is_named_before_the_readings(wrong, site):
     found = diagnose(per_device, given, [], key=jax.random.key(0), engine=Laplace(), settings=settings)
     assert found.verdict == "UNLISTED"
     assert found.sections["where"]["sites"][0]["site"] == site
+    assert not any("moves the values" in text for text in found.sections["fit"]["warnings"])
