@@ -1,5 +1,6 @@
 """Decentralised policies: each device decides by what it sees itself and the slot of the frame."""
 
+import operator
 from typing import Any, Protocol, final
 
 import equinox as eqx
@@ -189,16 +190,14 @@ def check_size(whole: Any, part: Any) -> None:
     Raises:
         InputError: the first difference.
     """
-    devices, capacity = (
-        (getattr(whole, name, None), getattr(part, name, None)) for name in ("devices", "capacity")
-    )
-    for name, (expected, got), least in (("devices", devices, ""), ("capacity", capacity, " or more")):
-        if expected is None or got is None or got == expected or (least and got > expected):
-            continue
-        what = f"{name} of {type(part).__name__}"
-        raise InputError(
-            what, f"{expected}{least}, as in {type(whole).__name__}", str(got), "Make it with as many"
-        )
+    for name, fits, bound in (("devices", operator.eq, ""), ("capacity", operator.ge, " or more")):
+        expected, got = getattr(whole, name, None), getattr(part, name, None)
+        if expected is not None and got is not None and not fits(got, expected):
+            what, wanted = (
+                f"{name} of {type(part).__name__}",
+                f"{expected}{bound}, as in {type(whole).__name__}",
+            )
+            raise InputError(what, wanted, str(got), "Make it with as many")
 
 
 def unroll(

@@ -15,23 +15,16 @@ type Arrays = dict[str, np.ndarray]
 
 _PACKED = ("scale_factor", "add_offset", "_FillValue", "missing_value")
 _TIME = re.compile(r"(\w+) since \d")
-_UNITS = {
-    "day": 86400,
-    "hour": 3600,
-    "minute": 60,
-    "second": 1,
-    "millisecond": 1e-3,
-    "microsecond": 1e-6,
-    "nanosecond": 1e-9,
+_SECONDS = {
+    **dict.fromkeys(("days", "day", "d"), 86400),
+    **dict.fromkeys(("hours", "hour", "h", "hr", "hrs"), 3600),
+    **dict.fromkeys(("minutes", "minute", "min", "mins"), 60),
+    **dict.fromkeys(("seconds", "second", "s", "sec", "secs"), 1),
+    **dict.fromkeys(("milliseconds", "millisecond", "ms", "msec", "msecs"), 1e-3),
+    **dict.fromkeys(("microseconds", "microsecond"), 1e-6),
+    **dict.fromkeys(("nanoseconds", "nanosecond"), 1e-9),
 }
-_SHORT = {
-    "day": ("d",),
-    "hour": ("h", "hr"),
-    "minute": ("min",),
-    "second": ("", "sec"),
-    "millisecond": ("m", "msec"),
-}
-"""Other names of these units, an s at their end left out."""
+"""Units of points in time as the conventions of NetCDF name them."""
 _NETCDF_DIMENSION_ONLY = b"This is a netCDF dimension but not a netCDF variable"
 
 
@@ -185,14 +178,11 @@ def _seconds(attributes: Mapping[str, Any]) -> float | int:
     found = _TIME.match(units.decode() if isinstance(units, bytes) else str(units))
     if found is None:
         return 1
-    word = found[1].lower().rstrip("s")
-    if word in {"month", "year"}:
-        got = f"{found[1]} since a date"
-        raise InputError(
-            "units of a point in time", f"one of {', '.join(_UNITS)}", got, "Write times as seconds"
-        )
-    known = (seconds for unit, seconds in _UNITS.items() if word in {unit, *_SHORT.get(unit, ())})
-    return next(known, 1)
+    word = found[1].lower()
+    if word in {"months", "month", "years", "year"}:
+        expected, got = "days, hours, minutes, seconds or parts of one", f"{found[1]} since a date"
+        raise InputError("units of a point in time", expected, got, "Write times as seconds")
+    return _SECONDS.get(word, 1)
 
 
 def _plain_complex(array: np.ndarray) -> np.ndarray:

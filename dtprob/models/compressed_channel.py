@@ -27,13 +27,13 @@ from dtprob.raytracing.calibration import Statistics, project
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.slab import Law
 
-_TINY: Final = 1e-30
-"""Least energy of what is left, where it counts."""
 type PathPhase = Literal["coherent", "per_packet", "per_path"]
 """Phases as traced; with an unknown phase of each link and snapshot; with an unknown error of each path besides."""
 
 _SMALLEST: Final = 1e-9
 """Directions of the paths' span whose part of the Gram matrix is smaller than this share of the largest are noise."""
+_TINY: Final = 1e-30
+"""Least energy of what is left, where it counts."""
 _AXES: Final = {
     **{name: AXES[name] for name in TRACED},
     "path_phase": AXES["path_phase"],

@@ -55,7 +55,7 @@ def broken(problem: Problem, starts: Sequence[np.ndarray]) -> InputError:
             return InputError(
                 f"data {argument}",
                 "finite values",
-                _counted(bad),
+                told_bad(bad),
                 "Remove these rows or mark them as missing",
             )
     values: Mapping[str, Any] = problem.compiled.sites(starts[0])
@@ -65,7 +65,7 @@ def broken(problem: Problem, starts: Sequence[np.ndarray]) -> InputError:
             return InputError(
                 f"{what}, site {name}",
                 "finite values at the centre of the prior",
-                _counted(bad),
+                told_bad(bad),
                 "Check the units of the data and the priors of what enters this site",
             )
     return _impossible(problem, starts) or InputError(
@@ -133,7 +133,8 @@ def check_noise(problem: Problem, fitted: Fit) -> None:
             )
 
 
-def _counted(bad: np.ndarray) -> str:
+def told_bad(bad: np.ndarray) -> str:
+    """How many entries are not as they should be, and the first of them, in words."""
     first = ", ".join(str(int(k)) for k in np.argwhere(bad)[0])
     return f"{int(bad.sum())} of {bad.size} that are not, the first at [{first}]"
 

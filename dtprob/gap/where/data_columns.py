@@ -9,6 +9,7 @@ import equinox as eqx
 import numpy as np
 
 from dtprob.errors import InputError
+from dtprob.gap.fitting.soundness import told_bad
 from dtprob.gap.model.problem import Problem
 from dtprob.models.declaration import Site
 
@@ -32,11 +33,9 @@ def check_finite(problem: Problem) -> None:
             lost.setdefault(column, []).append(counts & np.broadcast_to(missing, site.shape))
     for column, of_each in lost.items():
         if all(gaps.any() for gaps in of_each):
-            gaps = of_each[0]
-            first = ", ".join(str(int(k)) for k in np.argwhere(gaps)[0])
-            got = f"{int(gaps.sum())} that are not, the first at [{first}]"
             remedy = "Fill them, leave those readings out, or give the model no such column"
-            raise InputError(f"data {column}", "finite numbers beside each reading", got, remedy)
+            expected = "finite numbers beside each reading"
+            raise InputError(f"data {column}", expected, told_bad(of_each[0]), remedy)
 
 
 def columns(problem: Problem, axis: str, size: int, *, missing: bool = False) -> dict[str, np.ndarray]:

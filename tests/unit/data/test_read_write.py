@@ -529,7 +529,7 @@ def test_times_are_seconds_whatever_unit_they_were_stored_in(tmp_path, engine):
 @pytest.mark.parametrize("kind", ["i2", "i4", "i8", "f4"])
 def test_times_of_any_width_are_seconds(tmp_path, kind):
     days = np.array([17000, 17001], kind)
-    for units, seconds in (("days since 1970-01-01", 86400.0), ("resets since 2020", 1)):
+    for units, seconds in (("days since 1970-01-01", 86400.0), ("resets since 2020", 1), ("m since 2020", 1)):
         with h5py.File(tmp_path / "t.nc", "w") as file:
             file["time"] = days
             file["time"].attrs["units"] = units
