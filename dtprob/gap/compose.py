@@ -17,7 +17,6 @@ from dtprob.gap.located import along, unlisted, where
 from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.closed_share import closed_shares
-from dtprob.gap.where.kinds import whereabouts
 from dtprob.gap.where.site_finding import SiteFinding
 from dtprob.gap.which.screen import Screening
 from dtprob.gap.which.trials import credit
@@ -139,9 +138,8 @@ def _undecided(sets: Sequence[Sequence[str]]) -> str:
 def _place(found: SiteFinding) -> str:
     """A site, or a moment of an observation, as text, and where there."""
     what, _, whither = (found.moment or "").partition(" ")
-    there = whereabouts(found.family)
     site = f"the {what} of {found.site} {whither}".rstrip() if what else found.site
-    return f"{site} ({there})" if there else site
+    return f"{site} ({found.whereabouts})" if found.whereabouts else site
 
 
 def _tried(evidence: Evidence) -> list[dict[str, Any]]:

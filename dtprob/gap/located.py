@@ -99,5 +99,6 @@ def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, bool, floa
 
 
 def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:
-    there = {} if found.place is None else {"place": found.place}
+    told = {"moment": found.moment, "whereabouts": found.whereabouts, "place": found.place}
+    there = {name: words for name, words in told.items() if words is not None}
     return {"site": found.site, "p_value": found.p_value, "share": share, "family": found.family, **there}

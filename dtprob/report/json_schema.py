@@ -92,6 +92,7 @@ class Tried(TypedDict):
 class Site(TypedDict):
     """A site of the model, with its share of the gap; `family` says how it must change to close it.
 
+    `moment` is what of an observation is wrong where its values are right, `whereabouts` where or along what.
     Where one group, position or reading brings most of what is wrong, `place` names it.
     """
 
@@ -99,6 +100,8 @@ class Site(TypedDict):
     p_value: Probability | None
     share: Number
     family: NotRequired[str]
+    moment: NotRequired[str]
+    whereabouts: NotRequired[str]
     place: NotRequired[str]
 
 

@@ -5,7 +5,6 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
-from dtprob.gap.where import kinds
 from dtprob.report.json_schema import Cause, Coordinates, Interval, Remainder, Site, Size
 from dtprob.report.units import (
     Reading,
@@ -88,7 +87,7 @@ def site_words(site: str) -> str:
 
 def located_words(site: Site) -> str:
     """What of a site must change: its values, or a moment of what is observed there: `spread of the range`."""
-    what, _, whither = (moment(site) or "").partition(" ")
+    what, _, whither = site.get("moment", "").partition(" ")
     values = site_words(site["site"])
     return " ".join([f"{what} of the {values}", *map(words, whither.split())]) if what else values
 
@@ -100,8 +99,8 @@ def place_words(site: Site) -> str:
 
 def whereabouts(site: Site) -> str:
     """The same, and along what or where a site is wrong: ` (along day by access point, most of it at access point 11)`."""
-    there = kinds.whereabouts(site.get("family", ""))
-    return _in_brackets([*([_pattern_words(there)] if there else []), *_foremost(site)])
+    there = [_pattern_words(site["whereabouts"])] if "whereabouts" in site else []
+    return _in_brackets([*there, *_foremost(site)])
 
 
 def _foremost(site: Site) -> list[str]:
@@ -110,11 +109,6 @@ def _foremost(site: Site) -> list[str]:
 
 def _in_brackets(told: Sequence[str]) -> str:
     return f" ({', '.join(told)})" if told else ""
-
-
-def moment(site: Site) -> str | None:
-    """What of an observation is wrong where its values are right, as its family tells it."""
-    return kinds.moment(site.get("family", ""))
 
 
 def spoken(text: str, codes: Iterable[str]) -> str:

@@ -4,7 +4,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from dtprob.report.json_schema import Report, Site
-from dtprob.report.names import block, detail, listing, located_words, moment, significant, words
+from dtprob.report.names import block, detail, listing, located_words, significant, words
 
 _SUCH = {
     "repeats": "a receiver at its limit, a sensor that is stuck, a default where nothing was measured",
@@ -86,7 +86,7 @@ def changed(sites: Sequence[Site]) -> str:
 
 
 def _changed(site: Site) -> str:
-    what = (moment(site) or "values").partition(" ")[0]
+    what = site.get("moment", "values").partition(" ")[0]
     verb = "cause" if what in ("dependence", "repeats") else "change"
     such = f" ({_SUCH[what]})" if what in _SUCH else ""
     return f"{verb} the {located_words(site)}{such}"

@@ -13,7 +13,6 @@ from dtprob.report.names import (
     is_unchanged,
     listing,
     located_words,
-    moment,
     shares,
     significant,
     size_reading,
@@ -168,7 +167,7 @@ def _unlisted(report: Report) -> Story:
     left = left_over(report)
     look = (
         "Look for physics that the twin lacks where the gap lies, and declare it as a new effect."
-        if not left or any(moment(site) is None for site in left)
+        if not left or any("moment" not in site for site in left)
         else "The values that the twin computes show nothing wrong; what it says of its errors does. Look for what "
         f"could {changed(left[:2])}, or declare errors that are so."
     )

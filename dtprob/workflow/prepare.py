@@ -100,6 +100,12 @@ def prepare(
     case = dataclasses.replace(case, data=dataclasses.replace(case.data, file=located(case.data.file)))
     engine = make_engine(case.engine, f"{case.path.name} [engine]")
     model = _model(case)
+    if case.scene is not None and "paths" not in inspect.signature(model).parameters:
+        expected, remedy = (
+            "a model that takes paths, such as ray_traced_channel",
+            "Leave [scene] out, or choose such a model",
+        )
+        raise InputError(f"{case.path.name} [scene]", expected, case.model.name, remedy)
     say(f"reading {case.data.file.name}")
     arguments = _arguments(case, model, case.data.file, cache, say)
     model = taking(model, arguments, case.data.cluster)

@@ -290,7 +290,7 @@ def test_a_spread_is_called_a_spread(examples: dict[str, Any]) -> None:
     report = examples["UNLISTED"]()
     report["where"]["sites"] = [
         {"site": "noiseless_channel", "p_value": 1e-9, "share": 0.9, "family": "additive, link"},
-        {"site": "channel", "p_value": 1e-9, "share": 0.9, "family": "spread, by link"},
+        {"site": "channel", "p_value": 1e-9, "share": 0.9, "family": "spread, by link", "moment": "spread"},
     ]
     report["unlisted"] |= {"sites": ["channel"], "located": report["where"]["sites"][1:]}
     text = Page(render(report, None, title="x")).text

@@ -37,7 +37,7 @@ def over_plane(names: tuple[str, str], place: np.ndarray) -> Curves:
     """Products of smooth curves along each of two columns (size, 2)."""
     first, second = (waves(rank(column), 1, _CROSSED) for column in place.T)
     products = first[:, None] * second[None]
-    return Curves(f"over {names[0]} and {names[1]}", products.reshape(-1, len(place)))
+    return Curves(f"over {names[0]} and {names[1]}", products.reshape(-1, len(place)), says_where=True)
 
 
 def _neighbourhoods(over: tuple[str, str], place: np.ndarray) -> Curves:
@@ -66,7 +66,7 @@ def products(columns: Mapping[str, np.ndarray], pairs: Sequence[tuple[str, str]]
 def along_in_groups(group: Curves, name: str, column: np.ndarray) -> Iterator[Curves]:
     """What varies with a column (size,) in each group: along it, and between two of its values."""
     lines = sparse.csr_matrix(group.values).multiply(line(column)).tocsr()
-    yield replace(group, label=f"along {name} {group.label}", column=None, values=lines)
+    yield replace(group, label=f"along {name} {group.label}", column=None, values=lines, says_where=True)
     yield from in_groups(group, *between(f"between two values of {name}", name, column))
 
 

@@ -48,6 +48,7 @@ class Curves:
         values: (weight, position).
         ripple: of a band of ripples, what they are along.
         column: of groups of positions, the column of the data that makes them.
+        says_where: whether the label says where or along what, which helps whoever looks for a cause.
         plain: whether they follow a column, which the user knows by name, and not positions alone.
         simple: whether they are what most causes do: smooth along one axis or column, or by the groups of one.
         overlaps: whether they tell the same many times over: their largest score says where, but their sum says nothing.
@@ -58,6 +59,7 @@ class Curves:
     values: np.ndarray | sparse.csr_matrix
     ripple: Ripple | None = None
     column: str | None = None
+    says_where: bool = False
     plain: bool = False
     simple: bool = False
     overlaps: bool = False
@@ -100,10 +102,11 @@ def groups_in_words(index: np.ndarray, columns: Mapping[str, np.ndarray]) -> tup
 def cycles(size: int, over: str, *, turns: int = _TURNS) -> tuple[Curves, ...]:
     """For each period, the phases at which something may repeat along axes of some positions; none where they are short."""
     place = np.arange(size)
-    return tuple(
-        Curves(f"every {period} along {over}", sparse.csr_matrix((np.ones(size), (place % period, place))))
+    made = (
+        (period, sparse.csr_matrix((np.ones(size), (place % period, place))))
         for period in range(2, min(_LONGEST, size // turns) + 1)
     )
+    return tuple(Curves(f"every {period} along {over}", v, says_where=True) for period, v in made)
 
 
 def stretches(size: int, over: str) -> tuple[Curves, ...]:
@@ -117,7 +120,7 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
 
 def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     """Smooth over a column (size,), beyond values that part its ranks into equal shares, and ripples over them."""
-    yield Curves(f"along {name}", _smooth(column), plain=True, simple=True)
+    yield Curves(f"along {name}", _smooth(column), says_where=True, plain=True, simple=True)
     cuts = np.unique(np.quantile(column, np.arange(1, _SHARES) / _SHARES))
     steps = np.where(column > cuts[:, None], 0.5, -0.5)
     places = tuple(f"beyond {cut:.4g} of {name}" for cut in cuts)

@@ -63,13 +63,26 @@ class FamilyTest(NamedTuple):
         return np.where(seen, self.first[0] ** 2 / np.where(seen, self.variance, 1.0), 0.0)
 
     @property
-    def label(self) -> str:
-        """The family in words; of curves that overlap, the place that tells most."""
+    def pattern(self) -> str:
+        """How the family varies, in words; of curves that overlap, the place that tells most."""
+        return self.family.pattern.label if (place := self._place) is None else place
+
+    @property
+    def whereabouts(self) -> str | None:
+        """The same, where it says where or along what."""
+        curves = self.family.pattern.curves
+        return self._place or (
+            self.family.pattern.label if curves is not None and curves.says_where else None
+        )
+
+    @property
+    def _place(self) -> str | None:
+        """Of curves that overlap, the place that tells most."""
         curves = self.family.pattern.curves
         if curves is None or not curves.overlaps or not self.seen.any():
-            return self.family.label
+            return None
         told = self.told
-        return f"{self.family.kind}, {curves.places[int(told.argmax()) // (len(told) // len(curves.places))]}"
+        return curves.places[int(told.argmax()) // (len(told) // len(curves.places))]
 
 
 def family_test(family: Family, scores: np.ndarray, normal: np.ndarray | None = None) -> FamilyTest:

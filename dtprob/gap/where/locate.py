@@ -254,7 +254,7 @@ def _energy(problem: Problem, drawn: Replicates) -> float:
 def _beyond(name: str, tests: Sequence[FamilyTest], in_all: InAll) -> SiteFinding:
     """The further moment of an observation with the smallest p-value; nothing that a fit could move stands for it."""
     best = min(tests, key=lambda test: test.p_value)
-    return SiteFinding(name, best.family.label, in_all.p_value(best), None)
+    return SiteFinding(name, best.family.kind, best.pattern, in_all.p_value(best), None)
 
 
 def _each(test: FamilyTest) -> float:
@@ -287,4 +287,16 @@ def _finding(
     if p_value <= SURE:
         named = plainest(best, tests)
         place = foremost(named, tests, site)
-    return SiteFinding(site.name, named.label, p_value, net, spreads=spreads, score=score, place=place)
+    curves = named.family.pattern.curves
+    return SiteFinding(
+        site.name,
+        named.family.kind,
+        named.pattern,
+        p_value,
+        net,
+        spreads=spreads,
+        score=score,
+        place=place,
+        whereabouts=named.whereabouts,
+        is_ripple=curves is not None and curves.ripple is not None,
+    )

@@ -123,4 +123,10 @@ def _of_each(curves: Curves, axis: str, size: int) -> Curves:
     """Curves along the last of a site's two axes, each position of the first with weights of its own."""
     each = sparse.csr_matrix(sparse.kron(sparse.identity(size), curves.values))
     places = tuple(f"{axis} {i}, {place}" for i in range(size) for place in curves.places)
-    return Curves(f"{curves.label} x {axis}", each, overlaps=curves.overlaps, places=places)
+    return Curves(
+        f"{curves.label} x {axis}",
+        each,
+        says_where=curves.says_where,
+        overlaps=curves.overlaps,
+        places=places,
+    )

@@ -59,7 +59,7 @@ def repeats(problem: Problem, x: np.ndarray) -> Iterator[SiteFinding]:
         sure = next((one for one in found if one.p_value <= SURE), None)
         if sure is not None:
             place = f"the value {sure.value:.6g}, read {sure.often}"
-            yield SiteFinding(name, "repeats, each", sure.p_value, None, place=place)
+            yield SiteFinding(name, "repeats", "each", sure.p_value, None, place=place)
 
 
 def _readings(observed: whiten.Observation, values: np.ndarray, counted: np.ndarray) -> list[_Repeated]:

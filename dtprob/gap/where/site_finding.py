@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 from dtprob.gap.tails import LOG_SMALLEST, told_apart
-from dtprob.gap.where.kinds import moment
 
 SURE: Final = 0.005
 """Probability below which a site is surely wrong."""
@@ -18,6 +17,10 @@ _FAR_READINGS: Final = 1e-9
 """Probability of the tails from which far readings are what is wrong, and ripples of a spread follow them."""
 _LIKE_NOISE: Final = 20.0
 """Times the residuals' energy up to which a squared score over its variance is as noise makes it, in the best of many."""
+_MOMENTS: Final = frozenset(
+    ("spread", "shape", "skewness", "tails", "dispersion", "circularity", "dependence", "repeats")
+)
+"""First words of kinds of what may be wrong with an observation whose values are right."""
 
 
 @dataclass(frozen=True)
@@ -26,7 +29,8 @@ class SiteFinding:
 
     Attributes:
         site: its name.
-        family: what is added ("additive", "relative", "conjugate", "spread", ...) and how it varies.
+        kind: what is added ("additive", "relative", "conjugate", ...) or wrong ("spread", "dependence along link", ...).
+        pattern: how that varies, in words.
         p_value: family-wise over all sites and families.
         gain: nats that moving the site along its steepest direction would gain, nuisances refitted to first order; None
             where nothing that a model computes would move it.
@@ -34,21 +38,31 @@ class SiteFinding:
         spreads: whether moving the site moves nothing but spreads of observations.
         score: squared score of its values over the variance, on average over the entries of the family that has most.
         place: in words, of the one entry that brings most of what is wrong; None where several do.
+        whereabouts: the pattern, where it says where or along what something is wrong.
+        is_ripple: whether it varies in ripples, which find any reading that is far off.
     """
 
     site: str
-    family: str
+    kind: str
+    pattern: str
     p_value: float
     gain: float | None
     last: bool = False
     spreads: bool = False
     score: float = math.inf
     place: str | None = None
+    whereabouts: str | None = None
+    is_ripple: bool = False
+
+    @property
+    def family(self) -> str:
+        """What is added and how it varies, in words."""
+        return f"{self.kind}, {self.pattern}"
 
     @property
     def moment(self) -> str | None:
         """What of an observation is wrong: its spread, or what lies beyond; None where values are."""
-        return moment(self.family)
+        return self.kind if self.kind.split(" ")[0] in _MOMENTS else None
 
     @property
     def is_of_values(self) -> bool:
@@ -56,14 +70,9 @@ class SiteFinding:
         return self.moment is None and not self.spreads
 
     @property
-    def is_ripple(self) -> bool:
-        """Whether it varies in ripples, which find any reading that is far off."""
-        return "ripple" in self.family
-
-    @property
     def is_inline(self) -> bool:
         """Whether it is of readings themselves, which no site stands for one by one; a site that shows it says more."""
-        return self.family.startswith("location")
+        return self.kind == "location"
 
     @property
     def can_be_modelled(self) -> bool:

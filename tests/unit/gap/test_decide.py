@@ -13,7 +13,7 @@ from dtprob.gap.where.site_finding import SiteFinding
 from dtprob.gap.which.trials import Start, Trials, best, credit
 
 
-def evidence(kind, p_after, asked_for=(), left="additive, common", *, locates=True):
+def evidence(kind, p_after, asked_for=(), left="additive", *, locates=True):
     """What `decide` looks at: one accepted effect of a kind, and the sites' p-value beside it."""
     scores = SimpleNamespace(locating=frozenset({"a"} if locates else ()))
     view = SimpleNamespace(alarmed=lambda settings: True, screening=SimpleNamespace(scores=scores))
@@ -22,7 +22,7 @@ def evidence(kind, p_after, asked_for=(), left="additive, common", *, locates=Tr
         accepted=("a",),
         steps=[SimpleNamespace(view=view)],
         before=SimpleNamespace(site_p_value=1e-9),
-        after=SimpleNamespace(site_p_value=p_after, sites=(SiteFinding("y", left, p_after, 9.0),)),
+        after=SimpleNamespace(site_p_value=p_after, sites=(SiteFinding("y", left, "common", p_after, 9.0),)),
         asked_for=asked_for,
         remainder=None,
     )
@@ -56,11 +56,11 @@ def test_verdicts(kind, closed, p_after, verdict):
 @pytest.mark.parametrize(
     ("left", "locates", "closed", "verdict"),
     [
-        ("spread, by group", True, 0.37, "LISTED_WITH_REMAINDER"),
-        ("tails, common", True, 0.37, "LISTED_WITH_REMAINDER"),
-        ("spread, by group", True, 0.25, "UNLISTED"),
-        ("spread, by group", False, 0.37, "UNLISTED"),
-        ("relative, by group", True, 0.37, "UNLISTED"),
+        ("spread", True, 0.37, "LISTED_WITH_REMAINDER"),
+        ("tails", True, 0.37, "LISTED_WITH_REMAINDER"),
+        ("spread", True, 0.25, "UNLISTED"),
+        ("spread", False, 0.37, "UNLISTED"),
+        ("relative", True, 0.37, "UNLISTED"),
     ],
 )
 def test_what_moves_expectations_imitates_no_spread(left, locates, closed, verdict):
@@ -177,10 +177,10 @@ def test_several_effects_in_place_of_one_are_an_explanation():
 @pytest.mark.parametrize(
     ("left", "locates", "beside", "verdict"),
     [
-        ("additive, along x by group", False, 40.0, "UNLISTED"),
-        ("additive, along x by group", False, 60.0, "LISTED"),
-        ("additive, along x by group", True, 40.0, "LISTED"),
-        ("spread, by group", False, 40.0, "LISTED"),
+        ("additive", False, 40.0, "UNLISTED"),
+        ("additive", False, 60.0, "LISTED"),
+        ("additive", True, 40.0, "LISTED"),
+        ("spread", False, 40.0, "LISTED"),
     ],
 )
 def test_noise_that_hides_a_law_is_no_cause(left, locates, beside, verdict):

@@ -61,10 +61,10 @@ def test_what_imitates_part_of_an_unknown_cause_is_said(effects, said):
 
 def test_shares_are_of_a_gap_and_of_what_can_be_moved():
     found = [
-        SiteFinding("delay", "additive, common", 1e-9, 30.0),
-        SiteFinding("power", "additive, common", 0.01, 2.0),
-        SiteFinding("y", "spread, common", 0.2, 100.0),
-        SiteFinding("y", "dependence along link, common", 0.3, None),
+        SiteFinding("delay", "additive", "common", 1e-9, 30.0),
+        SiteFinding("power", "additive", "common", 0.01, 2.0),
+        SiteFinding("y", "spread", "common", 0.2, 100.0),
+        SiteFinding("y", "dependence along link", "common", 0.3, None),
     ]
     assert site_shares(found, 40.0, {"power": 0.9}) == [0.75, 0.9, 1.0, None]
     assert site_shares(found, 1e-3, {"power": 0.9}) == [None] * 4
@@ -72,9 +72,9 @@ def test_shares_are_of_a_gap_and_of_what_can_be_moved():
 
 def test_what_is_left_names_each_site_once_and_each_way_that_it_is_wrong():
     found = (
-        SiteFinding("y", "dependence along link, common", 1e-9, None),
-        SiteFinding("y", "spread, common", 1e-3, 3.0),
-        SiteFinding("power", "additive, common", 0.3, 1.0),
+        SiteFinding("y", "dependence along link", "common", 1e-9, None),
+        SiteFinding("y", "spread", "common", 1e-3, 3.0),
+        SiteFinding("power", "additive", "common", 0.3, 1.0),
     )
     left = unlisted(Location(found, (), {}, 1e-9), 0.005)
     assert left["p_value"] == 1e-9
@@ -84,8 +84,10 @@ def test_what_is_left_names_each_site_once_and_each_way_that_it_is_wrong():
 
 def test_it_is_said_where_a_site_is_wrong():
     sites = (
-        SiteFinding("mean", "additive, slot 408 to 435", 1e-9, 9.0, place="slot 410"),
-        SiteFinding("y", "spread, ripple in day, 9 to 16 half waves", 1e-9, None),
+        SiteFinding(
+            "mean", "additive", "slot 408 to 435", 1e-9, 9.0, place="slot 410", whereabouts="slot 408 to 435"
+        ),
+        SiteFinding("y", "spread", "ripple in day, 9 to 16 half waves", 1e-9, None),
     )
     evidence = SimpleNamespace(after=Location(sites, (), {}, 1e-9), problem=SimpleNamespace(effects=()))
     assert summary("UNLISTED", (), evidence).endswith(

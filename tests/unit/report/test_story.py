@@ -165,15 +165,21 @@ def test_that_no_effects_were_given_is_said() -> None:
 
 def _unlisted(*left: names.Site) -> names.Any:
     found = {"p_value": 1e-9, "sites": [site["site"] for site in left], "located": list(left)}
-    nothing: names.Site = {"site": "delay", "p_value": 0.9, "share": None, "family": "spread, common"}
+    nothing: names.Site = {
+        "site": "delay",
+        "p_value": 0.9,
+        "share": None,
+        "family": "spread, common",
+        "moment": "spread",
+    }
     where = {"sites": [*left, nothing], "coordinates": []}
     return {**_report(), "verdict": "UNLISTED", "causes": [], "unlisted": found, "where": where}
 
 
 def test_what_is_left_is_told_as_it_is_wrong() -> None:
-    report = _unlisted(
-        {"site": "delay", "p_value": 1e-9, "share": None, "family": "dependence on rss, common"}
-    )
+    moment = "dependence on rss"
+    left: names.Site = {"site": "delay", "p_value": 1e-9, "share": None, "family": f"{moment}, common"}
+    report = _unlisted({**left, "moment": moment})
     assert "lies in the dependence of the delay on RSS" in tell(report).meaning
     assert "cause the dependence of the delay on RSS, or declare errors that are so" in tell(report).action
     assert next_look(report).endswith("Look for what could cause the dependence of the delay on RSS.")
@@ -184,7 +190,9 @@ def test_what_is_left_is_told_as_it_is_wrong() -> None:
     [("skewness", "err to one side"), ("dispersion", "a schedule"), ("tails", "farther off")],
 )
 def test_what_makes_a_law_wrong_is_hinted_at(kind: str, hint: str) -> None:
-    report = _unlisted({"site": "delay", "p_value": 1e-9, "share": None, "family": f"{kind}, common"})
+    report = _unlisted(
+        {"site": "delay", "p_value": 1e-9, "share": None, "family": f"{kind}, common", "moment": kind}
+    )
     assert f"the {kind} of the delay" in tell(report).headline + tell(report).meaning
     assert f"change the {kind} of the delay (" in next_look(report)
     assert hint in next_look(report)
@@ -192,7 +200,13 @@ def test_what_makes_a_law_wrong_is_hinted_at(kind: str, hint: str) -> None:
 
 def test_a_value_that_is_wrong_calls_for_physics() -> None:
     values: names.Site = {"site": "range", "p_value": 1e-9, "share": 0.5, "family": "additive, common"}
-    spread: names.Site = {"site": "y", "p_value": 1e-3, "share": None, "family": "spread, by wall"}
+    spread: names.Site = {
+        "site": "y",
+        "p_value": 1e-3,
+        "share": None,
+        "family": "spread, by wall",
+        "moment": "spread",
+    }
     assert "Look for physics" in tell(_unlisted(values, spread)).action
     assert (
         "change the range and change the spread of the readings" not in tell(_unlisted(values, spread)).action
@@ -202,7 +216,7 @@ def test_a_value_that_is_wrong_calls_for_physics() -> None:
 
 def test_a_site_that_is_wrong_in_two_ways_is_told_as_it_is_most_surely() -> None:
     two = [
-        {"site": "y", "p_value": p, "share": None, "family": f}
+        {"site": "y", "p_value": p, "share": None, "family": f, "moment": f}
         for p, f in ((1e-9, "tails"), (1e-3, "spread"))
     ]
     report = {**_unlisted(), "unlisted": {"p_value": 1e-9, "sites": ["y"], "located": two}}
@@ -218,23 +232,19 @@ def test_the_place_that_stands_out_is_told_in_words() -> None:
 
 
 @pytest.mark.parametrize(
-    ("family", "told"),
+    ("whereabouts", "told"),
     [
-        ("additive, slot 408 to 435", " (slot 408 to 435)"),
-        ("spread, device 17, reading 438 to 468", " (device 17, reading 438 to 468)"),
-        ("relative, along day by access_point", " (along day by access point)"),
-        ("additive, over snr and load", " (over SNR and load)"),
-        ("additive, every 4 along episode and slot", " (every 4 along episode and slot)"),
-        ("additive, x[2] 2, x[0] -39.7 to -18.8", " (x[2] 2, x[0] -39.7 to -18.8)"),
-        ("additive, ripple in day, 9 to 16 half waves", ""),
-        ("dependence on those 2 before along report, each", ""),
-        ("additive, by access_point", ""),
-        ("additive", ""),
+        ("slot 408 to 435", " (slot 408 to 435)"),
+        ("along day by access_point", " (along day by access point)"),
+        ("over snr and load", " (over SNR and load)"),
+        ("x[2] 2, x[0] -39.7 to -18.8", " (x[2] 2, x[0] -39.7 to -18.8)"),
+        (None, ""),
     ],
 )
-def test_it_is_told_where_or_along_what_a_site_is_wrong(family: str, told: str) -> None:
-    """Which slots, devices and columns they are is what helps; a number of half waves does not."""
-    site = {"site": "mean", "p_value": 1e-9, "share": 0.9, "family": family}
+def test_it_is_told_where_or_along_what_a_site_is_wrong(whereabouts: str | None, told: str) -> None:
+    """Which slots, devices and columns they are is what helps; what does not say so is left out."""
+    site = {"site": "mean", "p_value": 1e-9, "share": 0.9, "family": "additive, ..."}
+    site |= {} if whereabouts is None else {"whereabouts": whereabouts}
     assert names.whereabouts(site) == told
     most = " (most of it at row 9)" if not told else f"{told[:-1]}, most of it at row 9)"
     assert names.whereabouts({**site, "place": "row 9"}) == most
@@ -257,6 +267,7 @@ def test_values_that_are_read_too_often_call_for_what_makes_them() -> None:
         "p_value": 1e-9,
         "share": None,
         "family": "repeats, each",
+        "moment": "repeats",
         "place": "the value -92, read 18 times",
     }
     report = {**_unlisted(), "unlisted": {"p_value": 1e-9, "sites": ["y"], "located": [site]}}

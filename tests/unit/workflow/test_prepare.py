@@ -259,6 +259,12 @@ def test_a_ray_traced_model_needs_a_scene(folder):
         prepare(load_case(folder / "case.toml"), need="fit")
 
 
+def test_a_scene_beside_a_model_without_paths_is_refused(folder):
+    change(folder, 'name = "ray_traced_channel"', 'name = "multi_access"')
+    with pytest.raises(InputError, match=r"\[scene\]: expected a model that takes paths.* got multi_access"):
+        prepare(load_case(folder / "case.toml"), need="fit")
+
+
 def test_a_scene_that_was_traced_at_another_carrier_is_refused(folder):
     change(folder, "frequency = 6000000000.0", "frequency = 6000.0")
     with pytest.raises(

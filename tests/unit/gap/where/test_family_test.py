@@ -1,10 +1,12 @@
 """The test of a family of scores: dense and sparse departures, and the level where there is none."""
 
+import re
+
 import numpy as np
 import pytest
 from scipy import stats
 
-from dtprob.gap.where.curves import stretches
+from dtprob.gap.where.curves import by_group, cycles, over_column, stretches
 from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import family_test
 
@@ -126,3 +128,31 @@ def test_rows_of_heavy_tails_that_are_right_are_no_gap(entries):
     p = np.array([family_test(FAMILY, np.asarray((sums @ row.T).T)).p_value for row in rows])
     assert (p < 1e-4).sum() == 0
     assert (p < 0.01).sum() <= stats.binom.ppf(0.999, seeds, 0.03)
+
+
+def test_names_of_columns_do_not_say_where_something_is_wrong():
+    """A digit or the word `ripple` in the name of a column is no place and no ripple; places and laws say where."""
+    column = np.random.default_rng(4).permutation(np.arange(40.0))
+    found = {c.label: c for c in over_column("ripple_2", column, 16)}
+    found |= {
+        c.label: c for c in (by_group("sensor_2", np.arange(40) % 4, np.arange(40) % 4), *cycles(120, "slot"))
+    }
+    scores = np.random.default_rng(5).normal(size=(100, 40))
+    scores[0] += 3.0 * (column > 20)
+
+    def tested(label):
+        curves = found[label]
+        size = curves.extent[1]
+        values = np.resize(scores, (100, size))
+        family = Family("additive", Pattern(label, (0,), curves), np.ones(()))
+        return family_test(family, values @ curves.values.T)
+
+    assert tested("by sensor_2").whereabouts is None
+    assert tested("along ripple_2").whereabouts == "along ripple_2"
+    assert tested("every 3 along slot").whereabouts == "every 3 along slot"
+    assert re.fullmatch(r"beyond [\d.]+ of ripple_2", tested("beyond a value of ripple_2").whereabouts or "")
+    assert [label for label, curves in found.items() if curves.ripple is not None] == [
+        "ripple in ripple_2, 5 to 8 half waves",
+        "ripple in ripple_2, 9 to 16 half waves",
+    ]
+    assert tested("ripple in ripple_2, 5 to 8 half waves").whereabouts is None

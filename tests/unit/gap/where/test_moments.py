@@ -22,7 +22,6 @@ from dtprob.gap.tails import family_wise
 from dtprob.gap.where.bounded import skewness, tails
 from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import family_test
-from dtprob.gap.where.kinds import moment
 from dtprob.gap.where.locate import locate
 from dtprob.gap.where.moments import _delayed, _kept, _shape, further_moments
 from dtprob.gap.where.site_finding import SiteFinding, likely_left, most_left
@@ -185,8 +184,8 @@ def test_an_outcome_that_follows_another_three_later_is_noticed_by_its_pair():
 
 
 def test_what_goes_together_leaves_what_its_chance_tells_unless_it_is_a_shadow():
-    values = SiteFinding("y", "additive, along time", 1e-9, 12.0)
-    together = SiteFinding("y", "dependence along time, common", 1e-20, None)
+    values = SiteFinding("y", "additive", "along time", 1e-9, 12.0)
+    together = SiteFinding("y", "dependence along time", "common", 1e-20, None)
     assert most_left([values, together]) == pytest.approx(20 * np.log(10))
     assert most_left([values, replace(together, last=True)]) == 12.0
     assert most_left([]) == 0.0
@@ -196,7 +195,7 @@ def test_what_goes_together_leaves_what_its_chance_tells_unless_it_is_a_shadow()
 
 @pytest.mark.parametrize(("p", "share"), [(1e-9, 1.0), (0.01, 0.875), (0.1, 0.374), (0.4, 0.0), (1.0, 0.0)])
 def test_what_is_not_surely_wrong_leaves_its_gain_as_far_as_it_is_likely_to_be_wrong(p, share):
-    found = SiteFinding("y", "additive, along time", p, 12.0)
+    found = SiteFinding("y", "additive", "along time", p, 12.0)
     assert likely_left([found]) == pytest.approx(12.0 * share, abs=0.02)
     assert likely_left([found, replace(found, gain=None)]) == likely_left([found])
     assert likely_left([]) == 0.0
@@ -240,9 +239,10 @@ def test_a_few_percent_that_err_to_one_side_are_noticed():
 
 
 def test_values_and_moments_are_told_apart():
-    assert moment("dependence along link, common") == "dependence along link"
-    assert moment("spread, by weekday") == "spread"
-    assert moment("relative, smooth in link") is None
+    dependence = SiteFinding("y", "dependence along link", "common", 1e-9, None)
+    assert dependence.moment == "dependence along link"
+    assert replace(dependence, kind="spread", pattern="by weekday").moment == "spread"
+    assert replace(dependence, kind="from the next spread", pattern="by spread").moment is None
 
 
 @pytest.mark.parametrize("shape", [skewness, tails])

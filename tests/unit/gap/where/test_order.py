@@ -49,16 +49,16 @@ def test_a_site_that_acts_through_another_alone_comes_after_it(seed, alike):
 @pytest.mark.parametrize(("of_spread", "first"), [(1e-3, "mean"), (1e-6, "mean"), (1e-12, "deviation")])
 def test_a_site_that_only_spreads_comes_after_values_that_are_surely_wrong(of_spread, first):
     """By whatever name; unless it is more than twice as surely wrong."""
-    mean = SiteFinding("mean", "additive, common", 1e-4, 20.0)
-    deviation = SiteFinding("deviation", "relative, common", of_spread, 20.0, spreads=True)
+    mean = SiteFinding("mean", "additive", "common", 1e-4, 20.0)
+    deviation = SiteFinding("deviation", "relative", "common", of_spread, 20.0, spreads=True)
     assert min(shadows_last([deviation, mean], 4.0), key=lambda found: found.last).site == first
 
 
 @pytest.mark.parametrize(("score", "first"), [(40.0, "spread"), (200.0, "mean")])
 def test_where_p_values_end_values_with_scores_that_noise_makes_come_last(score, first):
     """Noise of four times the energy makes squared scores of four on average, and some of 40 among many."""
-    mean = SiteFinding("mean", "relative, row", 1e-200, 800.0, score=score)
-    spread = SiteFinding("y", "spread, common", 3e-285, 8000.0)
+    mean = SiteFinding("mean", "relative", "row", 1e-200, 800.0, score=score)
+    spread = SiteFinding("y", "spread", "common", 3e-285, 8000.0)
     assert min(shadows_last([mean, spread], 4.0), key=lambda found: found.last) == replace(
         mean if first == "mean" else spread, last=False
     )
@@ -83,27 +83,32 @@ def test_far_off_it_is_still_told_whether_the_mean_or_its_noise_is_wrong(what):
 
 def test_what_is_read_again_and_again_comes_first() -> None:
     """A default of 3% spreads the readings far more surely than it is counted."""
-    alike = SiteFinding("y", "repeats, each", 1e-6, None, place="the value 0, read 17 times")
-    spread, mean = SiteFinding("y", "spread, y", 1e-200, None), SiteFinding("mean", "additive, y", 1e-90, 5.0)
+    alike = SiteFinding("y", "repeats", "each", 1e-6, None, place="the value 0, read 17 times")
+    spread, mean = (
+        SiteFinding("y", "spread", "y", 1e-200, None),
+        SiteFinding("mean", "additive", "y", 1e-90, 5.0),
+    )
     assert min(shadows_last([mean, spread, alike], 4.0), key=rank) == alike
     assert not any(found.repeats for found in (spread, mean))
 
 
 @pytest.mark.parametrize(
-    ("family", "p_of_tails", "is_first"),
+    ("pattern", "p_of_tails", "is_first"),
     [
         ("ripple in time, 33 to 64 half waves", 1e-30, False),
         ("ripple in time, 33 to 64 half waves", 1e-6, True),
         ("by group", 1e-30, True),
+        ("by ripple_counter", 1e-30, True),
     ],
 )
-def test_ripples_of_a_spread_follow_far_readings(family: str, p_of_tails: float, is_first: bool) -> None:
+def test_ripples_of_a_spread_follow_far_readings(pattern: str, p_of_tails: float, is_first: bool) -> None:
     """The finest ripples are surely wrong wherever some readings are far off; a group that is louder is not."""
+    is_ripple = pattern.startswith("ripple in")
     spread, tails = (
-        SiteFinding("y", f"spread, {family}", 1e-70, 0.0),
-        SiteFinding("y", "tails", p_of_tails, None),
+        SiteFinding("y", "spread", pattern, 1e-70, 0.0, is_ripple=is_ripple),
+        SiteFinding("y", "tails", "each", p_of_tails, None),
     )
-    deviation = SiteFinding("sd", f"additive, {family}", 1e-70, 0.0, spreads=True)
+    deviation = SiteFinding("sd", "additive", pattern, 1e-70, 0.0, spreads=True, is_ripple=is_ripple)
     found = sorted(shadows_last([spread, deviation, tails], 1.0), key=rank)
     assert (found[0].moment != "tails") == is_first
     assert [f.last for f in found if f.moment != "tails"] == [not is_first] * 2
