@@ -13,9 +13,11 @@ from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.at_end import shared_draws
 from dtprob.gap.how_far.terms import in_user_terms
+from dtprob.gap.keys import key_for
 from dtprob.gap.located import along, unlisted, where
 from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
+from dtprob.gap.vocabulary import Verdict
 from dtprob.gap.where.closed_share import closed_shares
 from dtprob.gap.where.site_finding import SiteFinding
 from dtprob.gap.which.screen import Screening
@@ -32,7 +34,7 @@ _MOST_ALIKE = 300
 def compose(
     evidence: Evidence,
     causes: tuple[Cause, ...],
-    verdict: str,
+    verdict: Verdict,
     *,
     settings: Settings,
     engine: AbstractEngine,
@@ -54,7 +56,7 @@ def compose(
             if one is not None
         ],
         "screening": _screening(evidence),
-        "fit": _fit(evidence, jax.random.fold_in(key, 3)),
+        "fit": _fit(evidence, key_for(key, "fit")),
         "provenance": {
             "engine": engine.name,
             "seed": _seed(key),
@@ -68,7 +70,9 @@ def compose(
     )
 
 
-def summary(verdict: str, causes: tuple[Cause, ...], evidence: Evidence, *, tolerated: bool = False) -> str:
+def summary(
+    verdict: Verdict, causes: tuple[Cause, ...], evidence: Evidence, *, tolerated: bool = False
+) -> str:
     """The verdict in one sentence.
 
     Args:

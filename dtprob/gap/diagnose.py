@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from types import MappingProxyType
 
@@ -10,8 +10,10 @@ import jax
 import numpy as np
 
 from dtprob.effects.effect import Effect
+from dtprob.effects.library import catalogue
 from dtprob.errors import InputError
 from dtprob.gap.compose import compose
+from dtprob.gap.decide import decide
 from dtprob.gap.diagnosis import Cause, Diagnosis
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.integrated import based
@@ -20,7 +22,8 @@ from dtprob.gap.fitting.states import held
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.remainder import model_remainder
 from dtprob.gap.how_far.shares import shares
-from dtprob.gap.how_far.terms import check_tolerance, is_within
+from dtprob.gap.how_far.terms import check_tolerance
+from dtprob.gap.keys import key_for
 from dtprob.gap.model.nulls import check_nulls
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.next_measurement.design_data import next_measurement
@@ -33,31 +36,28 @@ from dtprob.gap.which.classes import credible
 from dtprob.gap.which.confirm import confirm
 from dtprob.gap.which.search import search
 from dtprob.gap.which.trials import Say, credit
-from dtprob.inference.engine import AbstractEngine
+from dtprob.inference.engine import AbstractEngine, check_key
 from dtprob.inference.fit import resolve
-from dtprob.inference.posterior import Posterior
-from dtprob.models.arguments import Data, Model, taking
+from dtprob.inference.posterior import Sampler
+from dtprob.models.arguments import Data, Model, doubled, taking
+from dtprob.models.declaration import declare
 from dtprob.models.indices import check_indices
 from dtprob.models.support import check_support
 from dtprob.models.supported import differentiated_forwards
 
 _DEFAULT = Settings()
-_SOME = 0.2
-"""Share of the gap that causes close at least, surely, where what is left is of another kind."""
-_IDLE = 0.5
-"""Share of what a cause had gained below which it does little beside a model of what it leaves."""
 
 
 def diagnose(
     model: Model,
     data: Data,
-    effects: Sequence[Effect] = (),
+    effects: str | Iterable[str | Effect] = (),
     *,
     key: jax.Array,
     engine: str | AbstractEngine = "laplace",
     cluster: str | None = None,
     settings: Settings = _DEFAULT,
-    reference: Posterior | None = None,
+    reference: Sampler | None = None,
     designs: Mapping[str, Data] = MappingProxyType({}),
     say: Say = lambda _: None,
 ) -> Diagnosis:
@@ -66,8 +66,8 @@ def diagnose(
     Args:
         model: the base model, any NumPyro function with named deterministic sites.
         data: its arguments by name.
-        effects: the candidates; those that name a site the model lacks are an error. Without any, the diagnosis tells
-            whether and where there is a gap.
+        effects: the candidates, by name or effects of one's own, or "all" that the model and the data allow; see
+            `dtprob.effects.catalogue`. Without any, the diagnosis tells whether and where there is a gap.
         key: typed JAX key; the verdict does not depend on it beyond the declared error rates.
         engine: the engine that confirms the accepted causes and gives their sizes, or its name.
         cluster: axis, or column of the data (of the model's arguments or not), whose values are independent of one another;
@@ -80,16 +80,52 @@ def diagnose(
         say: receives one line at each stage, for progress.
 
     Raises:
-        InputError: effects on absent sites, effects that change the model at their null, fewer than four clusters, as many
-            unknowns that clusters share as there are data, indices in data beyond an array's end, columns with missing
-            values, observed values that their distribution cannot take or that are impossible under the base model, a base
-            model that does not fit, or one that meets the data exactly.
+        InputError: an argument of another kind, unknown effects, effects on absent sites, effects that change the
+            model at their null, fewer than four clusters, as many unknowns that clusters share as there are data,
+            indices in data beyond an array's end, columns with missing values, observed values that their
+            distribution cannot take or that are impossible under the base model, a base model that does not fit, or
+            one that meets the data exactly.
     """
-    engine = resolve(engine) if isinstance(engine, str) else engine
-    model = taking(model, data, cluster)
+    check_key(key)
+    if not isinstance(settings, Settings):
+        got, remedy = type(settings).__name__, "Write dtprob.gap.settings.Settings(...)"
+        raise InputError("settings of a diagnosis", "Settings", got, remedy)
+    if reference is not None and not callable(getattr(reference, "sample", None)):
+        got, remedy = type(reference).__name__, "Give what dtprob.fit(model, earlier_data, ...) returns"
+        raise InputError("reference of a diagnosis", "a posterior", got, remedy)
+    with jax.enable_x64(True):
+        data, designs = doubled(data), {name: doubled(one) for name, one in designs.items()}
+        return _diagnose(
+            taking(model, data, cluster),
+            data,
+            effects,
+            key=key,
+            engine=resolve(engine),
+            cluster=cluster,
+            settings=settings,
+            reference=reference,
+            designs=designs,
+            say=say,
+        )
+
+
+def _diagnose(
+    model: Model,
+    data: Data,
+    effects: str | Iterable[str | Effect],
+    *,
+    key: jax.Array,
+    engine: AbstractEngine,
+    cluster: str | None,
+    settings: Settings,
+    reference: Sampler | None,
+    designs: Mapping[str, Data],
+    say: Say,
+) -> Diagnosis:
+    """`diagnose` in double precision, its arguments checked."""
     check_indices(model, data)
     check_support(model, data)
-    problem = Problem(model, data, effects, cluster, reference)
+    problem = Problem(model, data, _candidates(model, data, effects), cluster, reference)
     if (told := int((problem.n_observation_of_each > 0).sum())) < 4:
         raise InputError(
             "clusters",
@@ -108,21 +144,30 @@ def diagnose(
     check_nulls(problem)
     check_finite(problem)
     evidence = _gather(problem, key, settings, say)
-    causes = _causes(evidence, jax.random.fold_in(key, 7), engine, settings, say)
+    causes = _causes(evidence, key_for(key, "confirm"), engine, settings, say)
     verdict = decide(evidence, causes, settings)
     found = compose(evidence, causes, verdict, settings=settings, engine=engine, key=key)
     plan = next_measurement(evidence, causes, designs) if verdict == "UNDETERMINED" else None
     return replace(found, sections={**found.sections, "next_measurement": plan})
 
 
+def _candidates(model: Model, data: Data, effects: str | Iterable[str | Effect]) -> tuple[Effect, ...]:
+    """The effects, those by name among them taken from the library."""
+    if effects != "all":
+        given = (effects,) if isinstance(effects, str) else tuple(effects)
+        if (own := tuple(e for e in given if isinstance(e, Effect))) == given:
+            return own
+        effects = given
+    return catalogue(declare(model, data).sites, data, effects)
+
+
 def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> Evidence:
-    keys = jax.random.split(key, 3)
     noted = [*lopsided(problem), *read_twice(problem)]
     for note in noted:
         say(f"note: {note}")
     say(f"fitting the base model to {problem.n_cluster} clusters ({problem.cluster_name})")
     with differentiated_forwards():
-        start = based(problem, keys[0], polished=settings.polished, say=say)
+        start = based(problem, key_for(key, "base"), polished=settings.polished, say=say)
     problem, base = start.problem, start.fitted
     check_possible(problem, base)
     check_noise(problem, base)
@@ -130,7 +175,7 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     of_fit = notes(problem, base)
     for note in of_fit:
         say(f"note: {note}")
-    searched = search(problem, base, keys[1], settings, say)
+    searched = search(problem, base, key_for(key, "search"), settings, say)
     steps = searched.steps
     noted = (*noted, *of_fit, *idle(steps[0].view.screening.absorbed_by))
     problem, base, last = steps[0].view.problem, steps[0].view.fitted, steps[-1].view
@@ -148,18 +193,36 @@ def _gather(problem: Problem, key: jax.Array, settings: Settings, say: Say) -> E
     left = max([by_sites, *map(last.screening.promise_of, asked_for)])
     floor = closed.floor(last.problem, last.fitted, held_after, left, len(np.unique(assignment)))
     held = held_before, held_after
-    fraction = closed.closed_fraction(*held, floor, keys[2]) if last.fitted.effects else None
-    parts = shares(last.problem, last.fitted, held, assignment, keys[2]) if fraction is not None else ()
+    fraction = closed.closed_fraction(*held, floor, key_for(key, "closed")) if last.fitted.effects else None
+    parts = (
+        shares(last.problem, last.fitted, held, assignment, key_for(key, "shares"))
+        if fraction is not None
+        else ()
+    )
     rest = None
     # even if scores say that little is left, as where a wide spread hides it
     if settings.remainder and any(site.can_be_modelled for site in wrong):
         say("modelling what is left at its site")
-        rest = model_remainder(last, folds, held_after, floor.best, keys[2])
+        rest = model_remainder(last, folds, held_after, floor.best, key_for(key, "remainder"))
     if rest is not None:
         floor = closed.shown(floor, held_after, rest.held)
-        fraction = closed.closed_fraction(*held, floor, keys[2]) if last.fitted.effects else None
-    judged = problem, base, tuple(steps), held_before, held_after, floor, fraction, parts, noted
-    return Evidence(*judged, remainder=rest, rivals=searched.rivals, asked_for=asked_for)
+        fraction = (
+            closed.closed_fraction(*held, floor, key_for(key, "closed")) if last.fitted.effects else None
+        )
+    return Evidence(
+        problem=problem,
+        base=base,
+        steps=tuple(steps),
+        held_before=held_before,
+        held_after=held_after,
+        floor=floor,
+        fraction=fraction,
+        shares=parts,
+        notes=noted,
+        remainder=rest,
+        rivals=searched.rivals,
+        asked_for=asked_for,
+    )
 
 
 def _asked_for(last: View, settings: Settings) -> tuple[str, ...]:
@@ -176,7 +239,8 @@ def _causes(
         return ()
     say(f"confirming {', '.join(evidence.accepted)} with {type(engine).__name__}")
     effects = [e for e in evidence.last.problem.effects if e.name in evidence.accepted]
-    sizes, plausible = confirm(evidence.last.problem, evidence.fitted, effects, key, engine)
+    own = evidence.last.problem, evidence.fitted, effects
+    sizes, plausible = confirm(*own, key_for(key, "sizes"), engine)
     classes, probability = alternatives(evidence, settings)
     first = min(effects, key=lambda effect: effect.kind == "variance")  # as their sizes are told
     estimates = evidence.held_after.estimates[first.site_name(first.parameters[0].name)]
@@ -189,7 +253,9 @@ def _causes(
         probability=probability,
         size=sizes,
         closed_fraction=evidence.fraction,
-        explained=None if evidence.fraction is None else closed.share(*held, but_for_fields, key),
+        explained=None
+        if evidence.fraction is None
+        else closed.share(*held, but_for_fields, key_for(key, "explained")),
         parameters=evidence.floor.parameters,
         shares=evidence.shares,
         physics=physics,
@@ -204,63 +270,3 @@ def alternatives(evidence: Evidence, settings: Settings) -> tuple[tuple[tuple[st
     found = evidence.explanations
     worth = {names: credit(evidence.problem, one.fitted, evidence.base) for names, one in found.items()}
     return credible(worth, evidence.accepted, settings.credibility)
-
-
-def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) -> str:
-    """The verdict."""
-    level = settings.level / 2
-    if not evidence.steps[0].view.alarmed(settings) or _negligible(evidence, settings):
-        return "NO_GAP"
-    if not causes:
-        return "UNLISTED" if evidence.before.site_p_value <= level else "UNDETERMINED"
-    cause = causes[0]
-    remains = evidence.after.site_p_value <= level
-    explained = cause.explained
-    if explained is None:
-        return "UNLISTED" if remains else "UNDETERMINED"
-    is_poor = explained.mean < _relevance(evidence, settings)
-    is_poor = is_poor and not (explained.low >= _SOME and _leaves_moments(evidence, level))
-    is_too_large = not cause.plausible and _are_fields(evidence)
-    if remains and (is_poor or is_too_large or _hides(evidence, level)):
-        return "UNLISTED"
-    is_left = remains or bool(evidence.asked_for)
-    leaves = is_left and (explained.mean < 1 - settings.minor or _are_fields(evidence))
-    if cause.probability < settings.credibility:
-        # equally good sets that all leave something are imitations
-        return "UNLISTED" if leaves and remains else "UNDETERMINED"
-    return "LISTED_WITH_REMAINDER" if leaves else "LISTED"
-
-
-def _leaves_moments(evidence: Evidence, level: float) -> bool:
-    """Whether all that is left is how observations spread, of which what moves only expectations is no imitation."""
-    left = [s for s in evidence.after.sites if s.p_value <= level and not s.last]
-    locating = evidence.steps[0].view.screening.scores.locating
-    return bool(left) and set(evidence.accepted) <= locating and not any(s.is_of_values for s in left)
-
-
-def _hides(evidence: Evidence, level: float) -> bool:
-    """Whether all that was named is how observations spread, which hides a wrong law of their values and is idle beside it.
-
-    Beside a twin that is far too sure of itself any noise closes nearly all of a gap.
-    """
-    rest, locating = evidence.remainder, evidence.steps[0].view.screening.scores.locating
-    values = [s for s in evidence.after.sites if s.p_value <= level and s.is_of_values]
-    if rest is None or not values or not locating.isdisjoint(evidence.accepted):
-        return False
-    return rest.beside < _IDLE * (evidence.fitted.log_evidence - evidence.base.log_evidence)
-
-
-def _relevance(evidence: Evidence, settings: Settings) -> float:
-    """Share of the gap below which causes that leave something are no explanation; random fields imitate much."""
-    return max(settings.relevance, settings.field_relevance) if _are_fields(evidence) else settings.relevance
-
-
-def _are_fields(evidence: Evidence) -> bool:
-    """Whether all that was accepted are random fields, which close much of any gap by allowing for it."""
-    return all(e.kind == "variance" for e in evidence.problem.effects if e.name in evidence.accepted)
-
-
-def _negligible(evidence: Evidence, settings: Settings) -> bool:
-    """Whether the base model's held-out error is already below what the user cares about."""
-    tolerance = settings.tolerance_db
-    return tolerance is not None and is_within(evidence.problem, evidence.held_before, tolerance)

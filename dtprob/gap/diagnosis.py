@@ -11,6 +11,7 @@ import xarray as xr
 
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.how_far.shares import Share
+from dtprob.gap.vocabulary import Verdict
 from dtprob.inference.storage import renamed, without_slashes
 
 
@@ -63,7 +64,7 @@ class Diagnosis:
     `sections` holds the remaining parts of the report, each as plain numbers and text; `maps` the arrays of gap.nc.
     """
 
-    verdict: str
+    verdict: Verdict
     summary: str
     causes: tuple[Cause, ...]
     sections: Mapping[str, Any]

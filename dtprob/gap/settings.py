@@ -2,7 +2,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Any, Final
+
+from dtprob.errors import InputError
+
+_LEAST: Final = {
+    "replicates": 20,
+    "site_replicates": 10,
+    "site_times": 1,
+    "candidates": 1,
+    "polished": 0,
+    "max_effects": 1,
+    "folds": 2,
+    "grid": 2,
+    "starts": 1,
+}
+"""Of whole numbers."""
 
 
 @dataclass(frozen=True)
@@ -28,6 +44,9 @@ class Settings:
         remainder: whether what is left is modelled at its site, which takes long where sites have many entries.
         tolerance_db: residual error that the user does not care about, in dB below the signal; of powers, their root mean
             square error in dB, and of other readings, such as levels in dBm, that in their own unit. None for no tolerance.
+
+    Raises:
+        InputError: a number out of its range.
     """
 
     level: float = 0.01
@@ -46,3 +65,33 @@ class Settings:
     minor: float = 0.03
     remainder: bool = True
     tolerance_db: float | None = None
+
+    def __post_init__(self) -> None:
+        for setting in fields(self):
+            self._check(setting.name, getattr(self, setting.name))
+
+    def _check(self, name: str, value: Any) -> None:
+        if name in _LEAST:
+            is_number = isinstance(value, int) and not isinstance(value, bool)
+            is_right, expected = (
+                is_number and value >= _LEAST[name],
+                f"a whole number from {_LEAST[name]}",
+            )
+        elif name == "remainder":
+            is_right, expected = isinstance(value, bool), "true or false"
+        elif name == "tolerance_db":
+            is_right, expected = (
+                value is None or _is_within(value, 0.0, float("inf")),
+                "a positive number, or none",
+            )
+        elif name == "level":
+            is_right, expected = _is_within(value, 0.0, 1.0), "a probability between 0 and 1"
+        else:
+            is_right, expected = value in (0, 1) or _is_within(value, 0.0, 1.0), "a share from 0 to 1"
+        if not is_right:
+            raise InputError(f"settings of a diagnosis: {name}", expected, repr(value), "Correct the setting")
+
+
+def _is_within(value: Any, low: float, high: float) -> bool:
+    """Whether it is a number between two others, these left out."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and low < value < high

@@ -75,6 +75,16 @@ def as_arrays(data: Data) -> dict[str, Any]:
     return {name: _column(name, entry) for name, entry in dict(data).items()}
 
 
+def doubled(data: Data) -> dict[str, Any]:
+    """Data whose real and complex arrays are in double precision; call it where that is enabled."""
+
+    def wider(leaf: Any) -> Any:
+        is_narrow = isinstance(leaf, _ARRAYS) and leaf.dtype in (np.float32, np.complex64)
+        return leaf.astype(np.promote_types(leaf.dtype, np.float64)) if is_narrow else leaf
+
+    return jax.tree.map(wider, dict(data))
+
+
 def _column(name: str, entry: Any) -> Any:
     is_array, is_column = isinstance(entry, _ARRAYS), hasattr(entry, "__array__")
     if isinstance(entry, jax.Array) or (

@@ -11,7 +11,6 @@ from types import NoneType, UnionType
 from typing import (
     Annotated,
     Any,
-    Final,
     Literal,
     NotRequired,
     TypedDict,
@@ -24,11 +23,9 @@ from typing import (
 )
 
 from dtprob.errors import InputError, unknown_name
+from dtprob.gap.vocabulary import Verdict
 
-type Verdict = Literal["NO_GAP", "LISTED", "LISTED_WITH_REMAINDER", "UNLISTED", "UNDETERMINED"]
 type Number = float | None
-UNSEEN: Final = "nothing observed depends on it"
-"""What stands for the parameter that absorbs a candidate where there is none."""
 type Probability = Annotated[float, "0 to 1"]
 type Range = tuple[float, float]
 type BeforeAfter = tuple[Number, Number]

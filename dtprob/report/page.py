@@ -7,10 +7,11 @@ from typing import Any
 import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
+from dtprob.gap.vocabulary import UNSEEN
 from dtprob.report import names, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import UNSEEN, Candidate, Interval, Report, Tried, is_quiet, validate
+from dtprob.report.json_schema import Candidate, Interval, Report, Tried, is_quiet, validate
 from dtprob.report.next_step import left_over, next_look, next_step, rivals
 from dtprob.report.palette import DARK, LIGHT
 from dtprob.report.story import tell

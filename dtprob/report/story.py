@@ -3,9 +3,10 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+from dtprob.gap.vocabulary import UNSEEN
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import UNSEEN, Cause, Detectable, Report, is_quiet
+from dtprob.report.json_schema import Cause, Detectable, Report, is_quiet
 from dtprob.report.names import (
     LEVEL,
     aliases,

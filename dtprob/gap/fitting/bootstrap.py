@@ -13,6 +13,7 @@ import numpy as np
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.leverage import lost
 from dtprob.gap.fitting.projection import Projection
+from dtprob.gap.keys import key_for
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 
@@ -28,6 +29,7 @@ class Replicates:
 
     Attributes:
         problem, fitted, projection: where they are drawn.
+        key: of all draws.
         keys: one per replicate.
         raw: rows of the data (cluster, row), as if nothing had been fitted.
         rows: projected rows of the data and of the first replicates (1 + replicate, cluster, row).
@@ -38,6 +40,7 @@ class Replicates:
     problem: Problem
     fitted: Fit
     projection: Projection
+    key: jax.Array
     keys: jax.Array
     raw: np.ndarray
     rows: np.ndarray
@@ -81,13 +84,13 @@ def replicate(
         key: of the draws.
         settings: how many replicates there are, and how many of them are taken to the sites.
     """
-    keys = jax.random.split(key, settings.replicates)
+    keys = jax.random.split(key_for(key, "replicates"), settings.replicates)
     raw, observed = observed_rows(problem, fitted, projection)
     projected = _projected(problem, fitted, projection, keys[: settings.site_replicates])
     rows = np.concatenate([observed[None], projected])
     gradients = _site_gradients(problem, fitted, projection, rows)
     return Replicates(
-        problem, fitted, projection, keys, raw, rows, gradients, together=max(len(projected), 1)
+        problem, fitted, projection, key, keys, raw, rows, gradients, together=max(len(projected), 1)
     )
 
 
@@ -117,7 +120,7 @@ def more(drawn: Replicates, times: int) -> Replicates:
         times: how many more; see `Replicates.most`.
     """
     first = drawn.at_sites
-    keys = jax.random.split(jax.random.fold_in(drawn.keys[0], times), times * first)
+    keys = jax.random.split(key_for(drawn.key, f"{times} more"), times * first)
     projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
     observed = drawn.rows[:1]
     parts = [
@@ -136,7 +139,7 @@ def normal_like(drawn: Replicates) -> tuple[np.ndarray, dict[str, np.ndarray]]:
 
     Rare outcomes may be seen by no replicate; in these they have their share. What does not count has none.
     """
-    of_noise, of_prior = jax.random.split(jax.random.fold_in(drawn.keys[0], 1))
+    of_noise, of_prior = jax.random.split(key_for(drawn.key, "normal"))
     keys = jax.random.split(of_prior, drawn.at_sites)
     counts = drawn.problem.rows.of_entries(drawn.problem.observed.counted) > 0
     rows = counts * np.asarray(jax.random.normal(of_noise, (drawn.at_sites, *drawn.raw.shape)))

@@ -18,10 +18,9 @@ from dtprob.gap.fitting.states import are_states
 from dtprob.gap.model.inline import unnamed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation import whiten
+from dtprob.gap.vocabulary import UNSEEN
 from dtprob.models.declaration import base_constraint
 
-UNSEEN: Final = "nothing observed depends on it"
-"""What hides an effect that does nothing."""
 _VANISHED: Final = 1e-14
 """Share of the usual observed value below which a spread is rounding."""
 _MISFIT: Final = 30.0

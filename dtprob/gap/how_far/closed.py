@@ -22,6 +22,7 @@ from dtprob.gap.fitting.determined import shared_weights
 from dtprob.gap.fitting.marginal import marginal
 from dtprob.gap.fitting.refit import at_null_except
 from dtprob.gap.how_far.earlier import on_earlier_data
+from dtprob.gap.keys import key_for
 from dtprob.gap.model.misses import Miss
 from dtprob.gap.model.problem import Problem
 
@@ -262,7 +263,7 @@ def share(before: HeldOut, after: HeldOut, best: Floor, key: jax.Array, draws: i
     """The closed fraction of a gap that is known to be there, below zero where the loss grows; see `closed_fraction`."""
     gain, totals = _gains(before, after, key, draws)
     reached = float(after.log_likelihood.sum())
-    remainder = best.draws(draws, jax.random.fold_in(key, 1)) - reached
+    remainder = best.draws(draws, key_for(key, "floor")) - reached
     low, high = np.quantile(_fraction(totals, remainder), [0.05, 0.95])
     centre = float(_fraction(gain.sum(), best.middle - reached))
     return ClosedFraction(float(np.clip(centre, low, high)), float(low), float(high))
@@ -283,11 +284,11 @@ def _gains(before: HeldOut, after: HeldOut, key: jax.Array, draws: int) -> tuple
     """
     gain = after.log_likelihood - before.log_likelihood
     own = gain[after.alone].sum()
-    chance = np.asarray(jax.random.normal(jax.random.fold_in(key, 2), (draws,)))
+    chance = np.asarray(jax.random.normal(key_for(key, "width"), (draws,)))
     variance = max(before.doubt - after.doubt, 0.0) + 2 * max(own, 0.0)
     total, free = gain.sum(), max(len(gain) - len(after.alone) - 1, 1)
     stretch = np.sqrt((free + 1) / free) * stats.t.ppf(0.95, free) / stats.norm.ppf(0.95)
-    drawn = gain[resampled(len(gain), after.alone, key, draws)].sum(1)
+    drawn = gain[resampled(len(gain), after.alone, key_for(key, "clusters"), draws)].sum(1)
     return gain, total + stretch * (drawn - total) + np.sqrt(variance) * chance
 
 

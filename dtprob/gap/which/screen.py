@@ -20,10 +20,10 @@ from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.bootstrap import Replicates, more
 from dtprob.gap.fitting.plausible import is_one_sided, scales, sizes
 from dtprob.gap.fitting.projection import Projection
-from dtprob.gap.fitting.soundness import UNSEEN
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.tails import any_of, deviation, effective_tests
+from dtprob.gap.vocabulary import UNSEEN
 from dtprob.gap.which.detectable import Detectable, detectable
 from dtprob.gap.which.directions import surroundings, tangents
 from dtprob.gap.which.fields import tests_of_fields

@@ -16,6 +16,7 @@ import numpy as np
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.bound import bound
 from dtprob.gap.fitting.refit import BETTER, without
+from dtprob.gap.keys import key_for
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.view import View, view
@@ -89,7 +90,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     if field is not None and not fields[field].is_looked_for:
         say(f"looking for effects that {field} may have imitated")
         rest = refitted_without(end.problem, end.fitted, field)
-        key = jax.random.fold_in(key, 1)
+        key = key_for(key, "without the field")
         goal = credit(problem, end.fitted, base)
         begun = _without_trial(steps[0], rest.fitted, field)
         others = _forward(
@@ -98,7 +99,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         ways.append([*steps[:-1], *others])
         both = beside([step.view for step in others], field, _reached(problem, ways, base), base, settings)
         if both is not None:
-            key = jax.random.fold_in(key, 3)
+            key = key_for(key, "beside the field")
             others = _forward(
                 both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=goal
             )
@@ -108,7 +109,7 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     if pair is not None:
         say(f"starting from {pair[0]} and {pair[1]} together")
         both = refitted_with(bare, pair, settings)
-        key = jax.random.fold_in(key, 2)
+        key = key_for(key, "pair")
         if not bound(both.problem, both.fitted):
             others = _forward(
                 both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=reached
@@ -171,7 +172,7 @@ def _forward(
         seen = (
             begun.view
             if begun
-            else _looked(problem, fitted, jax.random.fold_in(key, len(steps)), settings, say)
+            else _looked(problem, fitted, key_for(key, f"step {len(steps)}"), settings, say)
         )
         little = seen.promise < settings.minor * (fitted.log_evidence - base.log_evidence)
         if (
@@ -199,7 +200,7 @@ def _forward(
             return steps
         near = (1 - _WITHIN) * goal + _WITHIN * base.log_evidence
         if credit(problem, trials.fits[accepted], base) > near:
-            keys = jax.random.fold_in(key, 1000 + len(steps))
+            keys = key_for(key, f"revision {len(steps)}")
             steps += _revised(steps[-1], base, keys, settings, say, banned=banned)
         reached = steps[-1].end
         problem, fitted = reached.problem, reached.fitted
@@ -259,7 +260,7 @@ def _revised(
             return
         rest = refitted_without(reached.problem, reached.fitted, left_out)
         looked.add(frozenset(rest.fitted.effects))
-        again = jax.random.fold_in(key, i)
+        again = key_for(key, f"look {i}")
         # chosen by scores alone
         seen = _looked(rest.problem, rest.fitted, again, settings, say, located=False)
         trials = tried(seen, settings, say, {left_out: reached}, banned=banned)

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from dtprob.gap.diagnose import decide
+from dtprob.gap.decide import decide
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.settings import Settings

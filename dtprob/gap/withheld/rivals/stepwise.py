@@ -11,6 +11,7 @@ import numpy as np
 
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.refit import polished, refit, starting_points
+from dtprob.gap.keys import key_for
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.gap.withheld.rivals.claim import Claim
@@ -97,5 +98,5 @@ def forward(seen: Look, criterion: Criterion, key: jax.Array, settings: Settings
         problem, fitted = trials.problem, trials.fits[ordered[0]]
         if len(fitted.effects) == settings.max_effects:
             break
-        here = look(problem, fitted, jax.random.fold_in(key, len(fitted.effects)), settings)
+        here = look(problem, fitted, key_for(key, f"step {len(fitted.effects)}"), settings)
     return Claim(p_value, fitted.effects, tuple(ranking))
