@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -39,7 +39,6 @@ STEPS = 900
 def main() -> None:
     """Run the benchmark and print its figures."""
     options = arguments()
-    jax.config.update("jax_enable_x64", True)
     if options.memory_only:
         print(json.dumps(memory(options.links)))
         return

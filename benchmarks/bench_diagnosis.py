@@ -19,10 +19,10 @@ import sys
 import time
 from typing import Any
 
+import dtprob
 from dtprob.threads import one_thread
-from dtprob.xla import avoid_miscompilation
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 one_thread()
 
 import jax  # noqa: E402
@@ -160,7 +160,6 @@ def main() -> None:
     parser.add_argument("--write", action="store_true", help="keep the figures")
     parser.add_argument("--alone", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
     if options.alone:
         print(json.dumps(measure(*options.case[0])))
         return

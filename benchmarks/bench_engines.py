@@ -17,9 +17,9 @@ import time
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -101,7 +101,6 @@ MODELS: Mapping[str, tuple[Callable[..., None], np.ndarray]] = {
 def main() -> None:
     """Run the benchmark and print its table."""
     options = arguments()
-    jax.config.update("jax_enable_x64", True)
     rows: list[dict[str, Any]] = []
     for name in options.model:
         model, x = MODELS[name]

@@ -19,9 +19,9 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -68,7 +68,6 @@ def place(x: Any, y: Any = None) -> None:
 def main() -> None:
     """Run the benchmark and print its figures."""
     options = arguments()
-    jax.config.update("jax_enable_x64", True)
     for part in options.part:
         kinds = (NUTS, BlackJAXNUTS)
         rows = [loop(kind, options.rounds) for kind in kinds] if part == "loop" else [sites(part, options)]

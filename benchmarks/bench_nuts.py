@@ -23,9 +23,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
@@ -52,7 +52,6 @@ class Outcome(NamedTuple):
 def main() -> None:
     """Run the benchmark and print its table."""
     options = arguments()
-    jax.config.update("jax_enable_x64", True)
     for name in options.problem:
         rows = compared(name, PROBLEMS[name](), options)
         if options.write:

@@ -23,9 +23,9 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any, NamedTuple
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
@@ -53,7 +53,6 @@ class Arrays(NamedTuple):
 
 def main() -> None:
     """Run what was asked and print its figures."""
-    jax.config.update("jax_enable_x64", True)
     options = arguments()
     if options.memory:
         figures = memory(options.memory)

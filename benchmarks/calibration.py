@@ -16,9 +16,9 @@ import itertools
 import time
 from typing import Any
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import numpy as np  # noqa: E402
@@ -50,7 +50,6 @@ type Counts = dict[str, dict[str, dict[str, list[int]]]]
 def main() -> None:
     """Run the calibration and print its table."""
     options = arguments()
-    jax.config.update("jax_enable_x64", True)
     end = time.monotonic() + options.seconds
     kept = recorded("calibration")
     counts: Counts = kept.get("counts", {}) if options.write or options.table else {}

@@ -13,9 +13,9 @@ import time
 from importlib import resources
 from typing import Any
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -44,7 +44,6 @@ def main() -> None:
         parser.add_argument(f"--{name}", type=int, default=default)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
     begin = time.process_time()
     paths = street(options.links)
     truth, draws, diverging = studied(paths, options)

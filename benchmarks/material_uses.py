@@ -10,9 +10,9 @@ everywhere; after it, what `calibrate` found from one receiver behind a corner.
 import argparse
 from typing import Any
 
-from dtprob.xla import avoid_miscompilation
+import dtprob
 
-avoid_miscompilation()  # before jax is imported
+dtprob.configure()  # before the first array
 
 import jax  # noqa: E402
 import jax.numpy as jnp  # noqa: E402
@@ -37,7 +37,6 @@ def main() -> None:
     parser.add_argument("--snapshots", type=int, default=5)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    jax.config.update("jax_enable_x64", True)
     paths, array = urban.scene()[1].tests, planar_array(SIDE, SIDE, SPEED_OF_LIGHT / urban.FREQUENCY / 2)
     true = gain(paths, urban.TRUE.permittivity, urban.TRUE.conductivity)
     real, noise_power = measured(paths, jnp.asarray(array), true, options.snapshots)

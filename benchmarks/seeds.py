@@ -19,7 +19,7 @@ from record import record
 
 from dtprob.case import load_case
 from dtprob.commands.diagnose import answer
-from dtprob.commands.run import configure
+from dtprob.commands.run import start_jax
 from dtprob.gap.withheld.rates import Rate
 
 
@@ -33,7 +33,7 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
-    configure()
+    start_jax()
     warnings.simplefilter("ignore")  # a report says itself what there is to note
     found = {}
     for file in sorted(options.study.rglob("case.toml")):

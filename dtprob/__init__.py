@@ -32,7 +32,12 @@ _ROOMS = (
     "twin",
     "workflow",
 )
-_FUNCTIONS = {"diagnose": "gap.diagnose", "fit": "inference.fit"}
+_FUNCTIONS = {
+    "configure": "precision",
+    "diagnose": "gap.diagnose",
+    "fit": "inference.fit",
+    "model": "models.declaration",
+}
 """For each function at the top, the module that has it."""
 
 

@@ -44,7 +44,7 @@ class Run:
     say: Say
 
 
-def configure() -> None:
+def start_jax() -> None:
     """Double precision, and compiled programs kept between commands."""
     jax.config.update("jax_enable_x64", True)
     keep_compiled()
@@ -53,7 +53,7 @@ def configure() -> None:
 @contextmanager
 def session() -> Generator[Say]:
     """Double precision, progress, and warnings told as plain lines, for the time of one command."""
-    configure()
+    start_jax()
     with telling() as say, warnings.catch_warnings():
         warnings.showwarning = lambda message, *_: say(f"note: {message}")
         yield say

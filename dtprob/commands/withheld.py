@@ -219,9 +219,9 @@ def _diagnose(job: _Job) -> str | None:
     avoid_miscompilation()
     from dtprob.case import load_case  # noqa: PLC0415  (after the compiler is set right)
     from dtprob.commands.diagnose import answer, answer_of_rivals  # noqa: PLC0415
-    from dtprob.commands.run import configure  # noqa: PLC0415
+    from dtprob.commands.run import start_jax  # noqa: PLC0415
 
-    configure()
+    start_jax()
     warnings.simplefilter("ignore")  # a report says itself what there is to note
     answers = {"report.json": answer, "rivals.json": answer_of_rivals}
     job.folder.mkdir(parents=True, exist_ok=True)

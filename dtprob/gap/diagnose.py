@@ -88,7 +88,7 @@ def diagnose(
     """
     check_key(key)
     if not isinstance(settings, Settings):
-        got, remedy = type(settings).__name__, "Write dtprob.gap.settings.Settings(...)"
+        got, remedy = type(settings).__name__, "Write dtprob.gap.Settings(...)"
         raise InputError("settings of a diagnosis", "Settings", got, remedy)
     if reference is not None and not callable(getattr(reference, "sample", None)):
         got, remedy = type(reference).__name__, "Give what dtprob.fit(model, earlier_data, ...) returns"

@@ -16,8 +16,8 @@ from dtprob.inference.circular import mean_direction
 from dtprob.inference.program import program_hash
 from dtprob.inference.target import Coordinates, Inputs, Target, free_value
 from dtprob.models.arguments import Data, Model, split_static
-from dtprob.models.declaration import Declaration, declare, trace_model
-from dtprob.models.supported import refuse_unsupported
+from dtprob.models.declaration import declare, trace_model
+from dtprob.models.supported import refuse_obs_mask, refuse_unsupported
 from dtprob.xla import warn_of_miscompilation
 
 _NORMAL_IQR = 1.349
@@ -112,7 +112,7 @@ def _make_target(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -
     if not declaration.latent:
         remedy = "Sample at least one unknown with numpyro.sample"
         raise InputError(f"model {declaration.name}", "a latent site", "none", remedy)
-    _refuse_obs_mask(declaration)
+    refuse_obs_mask(declaration)
     coordinates: dict[str, Coordinates] = {}
     start = 0
     for name, site in declaration.latent.items():
@@ -123,19 +123,6 @@ def _make_target(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -
     for place in coordinates.values():
         circular[place.start : place.stop] = place.is_circular
     return Target(model, declaration, coordinates, static, circular)
-
-
-def _refuse_obs_mask(declaration: Declaration) -> None:
-    """Refuse sites that NumPyro splits by `obs_mask`: what was observed has a latent twin without any density."""
-    for name in declaration.observed:
-        whole = name.removesuffix("_observed")
-        if (
-            whole != name
-            and f"{whole}_unobserved" in declaration.latent
-            and whole in declaration.deterministic
-        ):
-            remedy = "Put `with numpyro.handlers.mask(mask=...)` around the site instead"
-            raise InputError(f"observed site {whole!r}", "no obs_mask", "one", remedy)
 
 
 def _unconstrained_shapes(

@@ -12,7 +12,7 @@ from numpyro.distributions import biject_to, constraints
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, model_name, split_static
-from dtprob.models.declaration import base_constraint, trace_model
+from dtprob.models.declaration import Declaration, base_constraint, trace_model
 
 
 @contextmanager
@@ -79,6 +79,23 @@ def refuse_unsupported(model: Model, name: str, message: Mapping[str, Any]) -> N
             raise InputError(what, "plates without subsampling", got, "Give the plate its full size")
     if message["type"] == "sample" and not message["is_observed"]:
         _refuse_latent(what, name, message["fn"])
+
+
+def refuse_obs_mask(declaration: Declaration) -> None:
+    """Look for sites that NumPyro splits by `obs_mask`: what was observed has a latent twin without any density.
+
+    Raises:
+        InputError: there is one.
+    """
+    for name in declaration.observed:
+        whole = name.removesuffix("_observed")
+        if (
+            whole != name
+            and f"{whole}_unobserved" in declaration.latent
+            and whole in declaration.deterministic
+        ):
+            remedy = "Put `with numpyro.handlers.mask(mask=...)` around the site instead"
+            raise InputError(f"observed site {whole!r}", "no obs_mask", "one", remedy)
 
 
 def _refuse_latent(what: str, name: str, fn: Any) -> None:

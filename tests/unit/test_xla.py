@@ -1,5 +1,6 @@
 """The guard against a faulty compiler is there where it is needed, and only there."""
 
+import os
 import subprocess
 import sys
 import warnings
@@ -65,3 +66,24 @@ def test_the_fault_is_real_and_the_flag_avoids_it(guarded, monkeypatch):
     program = PROGRAM.format(guarded=guarded)
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == str(not guarded)
+
+
+@pytest.mark.parametrize("late", [False, True])
+def test_configure_is_in_time_or_says_that_it_is_not(late):
+    program = f"""
+import warnings
+import jax
+if {late}:
+    jax.numpy.ones(3)
+import dtprob, dtprob.xla
+with warnings.catch_warnings(record=True) as told:
+    warnings.simplefilter("always")
+    dtprob.configure()
+print(jax.config.jax_enable_x64, dtprob.xla.miscompiles(), len(told))
+"""
+    environment = {n: v for n, v in os.environ.items() if n != "XLA_FLAGS"}
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment
+    )
+    faulty = late and xla.version() in xla.FAULTY
+    assert done.stdout.split() == ["True", str(faulty), str(int(faulty))]

@@ -27,6 +27,7 @@ from dtprob.gap.model.decentred import decentred
 from dtprob.gap.model.declared import Declared
 from dtprob.gap.model.in_units import in_units
 from dtprob.gap.model.layout import Block, Known, Layout, make_layout, normal_of
+from dtprob.gap.model.masked import counted
 from dtprob.gap.model.observed import Observed
 from dtprob.gap.model.own import Own
 from dtprob.gap.model.prior import Prior
@@ -41,7 +42,7 @@ from dtprob.gap.observation import whiten
 from dtprob.inference.posterior import Sampler
 from dtprob.models.arguments import Data, Model, as_arrays, split_static, within
 from dtprob.models.declaration import Declaration, declare
-from dtprob.models.supported import check_supported
+from dtprob.models.supported import check_supported, refuse_obs_mask
 from dtprob.xla import warn_of_miscompilation
 
 _OF_EACH: Final = 10
@@ -84,8 +85,9 @@ class Problem:
         self._cluster = None if self.column else cluster
         self._declare(model, static)
         check_supported(model, data)
+        refuse_obs_mask(self.declaration)
         self._check_effects()
-        model = unrolled(real_sites(model, data), data)
+        model = counted(unrolled(real_sites(model, data), data), data)
         changed = {s for effect in effects for s in effect.rewrites} & self.declaration.latent.keys()
         if changed:
             model = within(model, lambda: drawn_apart(changed))

@@ -52,6 +52,7 @@ class Curves:
         plain: whether they follow a column, which the user knows by name, and not positions alone.
         simple: whether they are what most causes do: smooth along one axis or column, or by the groups of one.
         overlaps: whether they tell the same many times over: their largest score says where, but their sum says nothing.
+        computed: whether they run over what the model computes, which nobody has measured.
         places: where each of them lies, in words, of those that lie somewhere.
     """
 
@@ -63,6 +64,7 @@ class Curves:
     plain: bool = False
     simple: bool = False
     overlaps: bool = False
+    computed: bool = False
     places: tuple[str, ...] = ()
 
     @property

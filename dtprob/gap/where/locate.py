@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
@@ -217,7 +217,7 @@ def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[
     computed = {name: (problem.declaration.sites[name].axes, value) for name, value in values.items()}
     for name, (axes, value) in (columns | computed).items():
         if (found := quantity(name, axes, value)) is not None:
-            yield found
+            yield replace(found, computed=name not in columns)
     for name, (axes, value) in columns.items():
         yield from groups(name, axes, value)
     for axes, shape, given in _observed(problem):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -40,6 +40,7 @@ class Quantity:
         values: at their positions.
         ordered: whether its values are more than names: near ones may act alike.
         coded: whether its values stand for others, as numbers of groups do.
+        computed: whether the model computes it from its unknowns.
     """
 
     name: str
@@ -47,6 +48,7 @@ class Quantity:
     values: np.ndarray
     ordered: bool = True
     coded: bool = False
+    computed: bool = False
 
     def kept(self, axes: Sequence[str], shape: Sequence[int]) -> tuple[int, ...] | None:
         """Which of a site's axes are this one's; None where it lies on others."""
@@ -67,7 +69,8 @@ class Quantity:
             places = groups_in_words(index, {self.name: flat}) if not self.coded else ()
             yield Curves(f"by value of {self.name}", grouped(index), plain=True, places=places)
         if self.ordered:
-            yield from over_column(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
+            for found in over_column(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size)):
+                yield replace(found, computed=self.computed)
 
 
 def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | None:

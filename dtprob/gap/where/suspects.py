@@ -59,14 +59,17 @@ def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
     """The surest of a site's families, or one that says it in plainer words and is nearly as sure and as evident.
 
     Curves that overlap are tested together: what varies along another column shows in many of them, so that the most
-    evident of them and of the families of few weights is named. What varies over positions (a ripple, a cycle, each
+    evident of them and of the families of few weights is named, over a column of the data sooner than over what the model
+    computes. What varies over positions (a ripple, a cycle, each
     position by itself) is told by the column that it follows, where there is one.
     """
     pattern, most = surest.family.pattern, _NEARLY * np.log(max(surest.p_value, _FARTHEST))
     alike = [t for t in tests if t.family.kind == surest.family.kind and np.log(t.p_value) <= most]
     if _overlapping(pattern) is not None:
         few = [t for t in alike if len(t.variance) <= _FEW or _overlapping(t.family.pattern) is not None]
-        return max(few, key=_evidence)
+        best = max(few, key=_evidence)
+        told = max((t for t in few if not _is_computed(t.family.pattern)), key=_evidence, default=best)
+        return told if _evidence(told) >= _NEARLY * _evidence(best) else best
     if pattern.kept and not _is_plain(pattern):
         plain = max((t for t in alike if _is_plain(t.family.pattern)), key=_evidence, default=surest)
         return plain if _evidence(plain) >= _NEARLY * _evidence(surest) else surest
@@ -97,6 +100,11 @@ def _at_best_place(test: FamilyTest, curves: Curves) -> tuple[FamilyTest, float]
 def _is_plain(pattern: Pattern) -> bool:
     """Whether a pattern follows a column."""
     return pattern.curves is not None and pattern.curves.plain
+
+
+def _is_computed(pattern: Pattern) -> bool:
+    """Whether a pattern follows what the model computes."""
+    return pattern.curves is not None and pattern.curves.computed
 
 
 def _overlapping(pattern: Pattern) -> Curves | None:

@@ -1,0 +1,53 @@
+"""Latent sites under a mask, as the padded rows of groups have them: what is masked tells nothing, and its prior counts.
+
+Left out, the prior of a masked entry is flat: no mode exists, and what the data tell of everything else is the same.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import equinox as eqx
+import jax
+from numpyro.primitives import Messenger
+
+from dtprob.effects.changing import is_scan
+from dtprob.models.arguments import Data, Model, split_static, within
+from dtprob.models.declaration import trace_model
+from dtprob.wrapping import unwrapped, wrapped
+
+
+class _Counted(Messenger):
+    """Takes the masks off latent sites, those in the bodies of scans among them."""
+
+    def process_message(self, msg: dict[str, Any]) -> None:
+        """Take the mask off, if this is one."""
+        if is_scan(msg):
+            body, *rest = msg["args"]
+            msg["args"] = (_Counted(body), *rest)
+        elif _is_masked(msg):
+            own, _ = unwrapped(msg["fn"])
+            msg["fn"] = wrapped(own, msg["fn"], None)
+
+
+def counted(model: Model, data: Data) -> Model:
+    """The model with the prior of all entries of its latent sites; itself where none is masked.
+
+    Args:
+        model: any model.
+        data: its arguments by name.
+    """
+    arrays, static = split_static(data)
+    masked: list[str] = []
+
+    def run(arrays: Any, key: jax.Array) -> None:
+        trace = trace_model(model, eqx.combine(arrays, static), key)
+        masked.extend(name for name, message in trace.items() if _is_masked(message))
+
+    jax.eval_shape(run, arrays, jax.random.key(0))
+    return within(model, _Counted) if masked else model
+
+
+def _is_masked(message: dict[str, Any]) -> bool:
+    is_latent = message["type"] == "sample" and not message["is_observed"]
+    return is_latent and unwrapped(message["fn"])[1] is not None
