@@ -2,7 +2,6 @@
 
 import argparse
 import importlib
-import signal
 import sys
 import traceback
 from collections.abc import Sequence
@@ -12,12 +11,13 @@ from typing import Any, NoReturn
 from dtprob import __version__
 from dtprob.case import load_case, read_document
 from dtprob.commands.progress import unread
-from dtprob.errors import InputError, Terminated, nearest, raised_at
+from dtprob.errors import InputError, nearest, raised_at
 from dtprob.reproduce import FIGURES
+from dtprob.stopping import Stopping
 from dtprob.threads import one_thread
 from dtprob.xla import avoid_miscompilation
 
-DONE, FAILED, WRONG_INPUT, INTERRUPTED, TERMINATED = 0, 1, 2, 130, 143
+DONE, FAILED, WRONG_INPUT, INTERRUPTED = 0, 1, 2, 130
 
 COMMANDS = {
     "demo": "dtprob.commands.demo",
@@ -167,23 +167,31 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     options = vars(parser().parse_args(arguments))
     command, step, debug = options.pop("command"), options.pop("step", "run"), options.pop("debug", False)
-    signal.signal(signal.SIGTERM, _terminate)
     avoid_miscompilation()
     one_thread()
+    with Stopping() as stopping:
+        try:
+            return _run(command, step, options, stopping, debug=debug)
+        except KeyboardInterrupt:
+            resume = f" {_RESUMED.get(command, _GOES_ON)}" if "resume" in options else ""
+            return _fail(INTERRUPTED, f"stopped.{resume}", debug=debug)
+
+
+def _run(command: str, step: str, options: dict[str, Any], stopping: Stopping, *, debug: bool) -> int:
+    """Run a command, and make one line of what goes wrong."""
     try:
         if "case" in options:  # before anything heavy, so that a mistake in it shows at once
             options["case"] = load_case(options["case"])
         if "twin_case" in options:
             read_document(options["twin_case"])
         getattr(importlib.import_module(COMMANDS[command]), step)(**options)
-    except KeyboardInterrupt:
-        resume = f" {_RESUMED.get(command, _GOES_ON)}" if "resume" in options else ""
-        return _fail(INTERRUPTED, f"stopped.{resume}", debug=debug)
     except BrokenPipeError:
         unread()
     except InputError as error:
         return _fail(WRONG_INPUT, str(error), debug=debug)
     except Exception as error:  # noqa: BLE001  (the one place where any failure becomes one line)
+        if stopping.asked is not None:  # what the signal raised was made something else of
+            stopping.again()
         text = f"{command} failed: {type(error).__name__}: {str(error) or 'no message'}".rstrip(".")
         place = f" (in {where})" if (where := raised_at(error)) else ""
         return _fail(FAILED, f"{text}{place}. See how it came there with --debug.", debug=debug)
@@ -195,11 +203,6 @@ def _fail(status: int, text: str, *, debug: bool) -> int:
         traceback.print_exc()
     sys.stderr.write(f"dtprob: {' '.join(text.split())}\n")
     return status
-
-
-def _terminate(number: int, frame: object) -> NoReturn:
-    del number, frame
-    raise Terminated(TERMINATED)
 
 
 if __name__ == "__main__":

@@ -103,7 +103,9 @@ def summary(
             at = f"; most of it at {sites[0].place}" if sites and sites[0].place is not None else ""
             tail = f" It shows at {', '.join(map(_place, sites))}{at}." if sites else ""
             verb = "imitate" if best is not None and len(best.effects) > 1 else "imitates"
-            part = f" {name} {verb} part of it." if name else ""
+            part = (
+                f" {name} {verb} part of it." if best is not None and best.closed_fraction is not None else ""
+            )
             why = (
                 ", and none of the known effects explains it"
                 if evidence.problem.effects

@@ -13,7 +13,9 @@ import jax
 import numpy as np
 import pytest
 
+from dtprob import stopping
 from dtprob.cli import COMMANDS, main, parser
+from dtprob.errors import Terminated
 from dtprob.inference import SVI, Posterior
 
 MODEL = """
@@ -461,3 +463,33 @@ def test_an_interrupted_fit_leaves_no_half_files(case, tmp_path, number, status)
     if number == signal.SIGINT:
         assert text == "dtprob: stopped. Continue with the same command and --resume.\n"
     assert not list(out.iterdir())
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("lost", ["swallowed", "turned into another error"])
+def test_a_signal_whose_exception_is_lost_is_raised_again(number, lost, monkeypatch):
+    """Python swallows what is raised in a callback, and JAX makes a ValueError of it where it compares cache keys."""
+    monkeypatch.setattr(stopping, "_AGAIN", 0.05)
+
+    def lose() -> None:
+        with stopping.Stopping() as asked:
+            try:
+                signal.raise_signal(number)
+            except BaseException:  # noqa: BLE001
+                assert asked.asked == number
+                if lost == "turned into another error":
+                    asked.again()
+            time.sleep(5)
+
+    with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else Terminated):
+        lose()
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_a_signal_that_is_ignored_stays_so():
+    before = signal.signal(signal.SIGINT, signal.SIG_IGN)
+    try:
+        with stopping.Stopping():
+            signal.raise_signal(signal.SIGINT)
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -66,7 +66,7 @@ class Remainder:
 
     Attributes:
         terms: of the model, the one with the most evidence first.
-        closed: share of what the causes leave that it closes; below zero if it makes predictions worse.
+        closed: share of what the causes leave that it closes.
         held: held-out results with it.
         before, after: calibration of the predictions without and with it.
         beside: log evidence that the causes bring beside it; infinite where there are none.
@@ -83,7 +83,9 @@ class Remainder:
 def model_remainder(
     view: View, folds: Sequence[Fold], held: HeldOut, best: float, key: jax.Array
 ) -> Remainder | None:
-    """Model what a fit leaves, and judge the model on held-out clusters; None where nothing can be modelled.
+    """Model what a fit leaves, and judge the model on held-out clusters.
+
+    None where nothing can be modelled, or where no part of the model predicts clusters that were left out better.
 
     Args:
         view: the fit with the accepted effects, and the families that are suspected there.
@@ -97,14 +99,11 @@ def model_remainder(
     if not named:
         return None
     wider, fitted = _wider(view, named)
-    full = _forward(wider, fitted, tuple(named))
-    taken = sorted((n for n in named if n in full.effects), key=lambda n: -named[n].evidence)
-    if not taken:
+    found = _held(wider, _forward(wider, fitted, tuple(named)), folds, held)
+    if found is None:
         return None
-    refitted = closed.fold_fits(wider, full, np.sum([i * f.held for i, f in enumerate(folds)], axis=0))
-    # the causes are as hard to choose as they were, though here others of their families are no candidates
-    parts = [part._replace(charged=fold.charged) for part, fold in zip(refitted, folds, strict=True)]
-    after = closed.judged(wider, parts)
+    full, parts, after = found
+    taken = sorted((n for n in named if n in full.effects), key=lambda n: -named[n].evidence)
     reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
     size = sum(shared_weights(wider, full, n) for n in taken)
     cost = closed.cost(size, len(parts))
@@ -117,6 +116,21 @@ def model_remainder(
         calibration(wider, parts),
         full.log_evidence - _without(wider, full, fitted.effects) if fitted.effects else np.inf,
     )
+
+
+def _held(
+    wider: Problem, fits: Sequence[fitting.Fit], folds: Sequence[Fold], held: HeldOut
+) -> tuple[fitting.Fit, list[Fold], HeldOut] | None:
+    """The largest of nested fits that predicts held-out clusters better, the fits to the others, and their results."""
+    assignment = np.sum([i * fold.held for i, fold in enumerate(folds)], axis=0)
+    for full in reversed(fits):
+        refitted = closed.fold_fits(wider, full, assignment)
+        # the causes are as hard to choose as they were, though here others of their families are no candidates
+        parts = [part._replace(charged=fold.charged) for part, fold in zip(refitted, folds, strict=True)]
+        after = closed.judged(wider, parts)
+        if after.log_likelihood.sum() > held.log_likelihood.sum():
+            return full, parts, after
+    return None
 
 
 def _without(wider: Problem, full: fitting.Fit, causes: Sequence[str]) -> float:
@@ -207,29 +221,35 @@ def _wider(view: View, named: Mapping[str, Suspect]) -> tuple[Problem, fitting.F
 
 
 def shortlist(problem: Problem, suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
-    """The families to try: most evidence first, site by site, each thing once."""
+    """The families to try: the steadiest evidence first, site by site, each thing once, and the one with most evidence.
+
+    That one may be what each reading does by itself, which is what heavy tails look like.
+    """
     chosen: list[Suspect] = []
-    for suspect in sorted(suspects, key=lambda s: (-round(s.evidence, 3), s.rows is not None)):
+    for suspect in sorted(suspects, key=lambda s: (-round(s.steady, 3), s.rows is not None)):
         size = 0 if is_per_cluster(problem, suspect) else size_of(problem, suspect)
         label = suspect.family.pattern.label
         known = [s for s in chosen if s.family.pattern.label == label]
         same = any(s.site == suspect.site or suspect.evidence > _SAME * s.evidence for s in known)
         if suspect.evidence >= _LEAST and not same and size <= _WEIGHTS:
             chosen.append(suspect)
-    return tuple(_site_by_site(chosen)[:_TRIED])
+    turns = _site_by_site(chosen)
+    most = max(range(len(turns)), key=lambda i: turns[i].evidence, default=0)
+    return tuple(turns[:_TRIED] if most < _TRIED else [*turns[: _TRIED - 1], turns[most]])
 
 
-def _forward(problem: Problem, fitted: fitting.Fit, names: Sequence[str]) -> fitting.Fit:
-    """The fit with those of the fields that raise the evidence, each beside the ones before it, the best alone first."""
+def _forward(problem: Problem, fitted: fitting.Fit, names: Sequence[str]) -> list[fitting.Fit]:
+    """Fits with those of the fields that raise the evidence, each beside the ones before it, the best alone first."""
     alone = {name: _fitted_with(problem, fitted, name) for name in names}
-    taken = 0
+    found: list[fitting.Fit] = []
     for name in sorted(names, key=lambda name: -alone[name].log_evidence):
-        trial = _fitted_with(problem, fitted, name) if taken else alone[name]
+        trial = _fitted_with(problem, fitted, name) if found else alone[name]
         if trial.log_evidence > fitted.log_evidence + _LEAST:
-            fitted, taken = trial, taken + 1
-        if taken == _TAKEN:
+            fitted = trial
+            found.append(fitted)
+        if len(found) == _TAKEN:
             break
-    return fitted
+    return found
 
 
 def _fitted_with(problem: Problem, fitted: fitting.Fit, name: str) -> fitting.Fit:

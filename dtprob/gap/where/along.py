@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Iterator, Mapping
+from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -58,6 +59,22 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
     found = columns(problem, axis, size)
     made = {n: np.unique(c, return_inverse=True)[1] for n, c in found.items() if _makes_groups(c)}
     by = {n: by_group(n, index, found[n]) for n, index in made.items()}
+    for one in _over_columns(found, made, by):
+        yield replace(one, of_data=True)
+    for group in itertools.islice(by.values(), 0 if axis in found else MOST_PAIRS):
+        yield from in_groups(group, *between(f"stretch of {axis}", axis, np.arange(size)))
+
+
+def _over_columns(
+    found: Mapping[str, np.ndarray], made: Mapping[str, np.ndarray], by: Mapping[str, Curves]
+) -> Iterator[Curves]:
+    """What varies with columns (size,), alone and two together.
+
+    Args:
+        found: the columns.
+        made: groups (size,) of those that make some.
+        by: curves by these groups.
+    """
     for name, column in found.items():
         if _is_ordered(column):
             yield from over_column(name, column, _FINEST if len(found) <= _FEW else _COARSE)
@@ -65,8 +82,6 @@ def _curves(problem: Problem, axis: str, size: int) -> Iterator[Curves]:
             yield by[name]
     yield from _pairs(found, by)
     yield from itertools.islice(by_both(found, made), MOST_PAIRS)
-    for group in itertools.islice(by.values(), 0 if axis in found else MOST_PAIRS):
-        yield from in_groups(group, *between(f"stretch of {axis}", axis, np.arange(size)))
 
 
 def _pairs(found: Mapping[str, np.ndarray], by: Mapping[str, Curves]) -> Iterator[Curves]:

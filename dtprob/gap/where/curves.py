@@ -52,7 +52,7 @@ class Curves:
         plain: whether they follow a column, which the user knows by name, and not positions alone.
         simple: whether they are what most causes do: smooth along one axis or column, or by the groups of one.
         overlaps: whether they tell the same many times over: their largest score says where, but their sum says nothing.
-        computed: whether they run over what the model computes, which nobody has measured.
+        of_data: whether they run over columns of the data, which the user knows by name.
         places: where each of them lies, in words, of those that lie somewhere.
     """
 
@@ -64,7 +64,7 @@ class Curves:
     plain: bool = False
     simple: bool = False
     overlaps: bool = False
-    computed: bool = False
+    of_data: bool = False
     places: tuple[str, ...] = ()
 
     @property
@@ -121,17 +121,27 @@ def stretches(size: int, over: str) -> tuple[Curves, ...]:
 
 
 def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
-    """Smooth over a column (size,), beyond values that part its ranks into equal shares, and ripples over them."""
+    """Smooth over a column (size,), steps and bends at values that part its ranks into equal shares, and ripples."""
     yield Curves(f"along {name}", _smooth(column), says_where=True, plain=True, simple=True)
     cuts = np.unique(np.quantile(column, np.arange(1, _SHARES) / _SHARES))
     steps = np.where(column > cuts[:, None], 0.5, -0.5)
     places = tuple(f"beyond {cut:.4g} of {name}" for cut in cuts)
     yield Curves(f"beyond a value of {name}", steps, overlaps=True, places=places)
+    yield _bends(name, column, cuts)
     yield from between(f"between two values of {name}", name, column)
     finest = min(
         finest, len(np.unique(column)) - 1
     )  # finer ones are the same again at the values that there are
     yield from ripples(name, (column - column.min()) / np.ptp(column), finest)
+
+
+def _bends(name: str, column: np.ndarray, cuts: np.ndarray) -> Curves:
+    """Zero up to a value of a column (size,) and rising from there, as of what saturates, or of a breakpoint distance."""
+    beyond = np.maximum(column - cuts[:, None], 0.0)
+    rising = np.ptp(beyond, axis=1) > 0
+    values = np.stack([line(one) for one in beyond[rising]]) if rising.any() else np.zeros((0, len(column)))
+    places = tuple(f"bend at {cut:.4g} of {name}" for cut in cuts[rising])
+    return Curves(f"bend at a value of {name}", values, overlaps=True, places=places)
 
 
 def between(label: str, name: str, column: np.ndarray) -> Iterator[Curves]:

@@ -99,7 +99,7 @@ def locate(
             seen = _test_sites(problem, fitted, projection, more(drawn, times), ways)
     sure = {f.site for f in seen.of_sites if f.p_value <= SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
-    suspected = tuple(sorted(named, key=lambda s: -s.evidence))
+    suspected = tuple(sorted(named, key=lambda s: -s.steady))
     entries = {site.name: e for site, tests in seen.tested for e in _entries(site, tests)}
     towards_data = {name: -i for i, name in enumerate(problem.declaration.sites)}
     findings = shadows_last(seen.findings, _energy(problem, drawn))
@@ -287,7 +287,7 @@ def _finding(
     if p_value <= SURE:
         named = plainest(best, tests)
         place = foremost(named, tests, site)
-    curves = named.family.pattern.curves
+    curves = best.family.pattern.curves
     return SiteFinding(
         site.name,
         named.family.kind,
@@ -299,4 +299,5 @@ def _finding(
         place=place,
         whereabouts=named.whereabouts,
         is_ripple=curves is not None and curves.ripple is not None,
+        is_of_each=curves is None and len(best.variance) >= problem.observed.count,
     )

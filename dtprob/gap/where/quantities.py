@@ -61,6 +61,10 @@ class Quantity:
 
     def curves(self) -> Iterator[Curves]:
         """Smooth, and ripples over its values; where it takes few, by value, as entries of a table are."""
+        for found in self._curves():
+            yield replace(found, of_data=not self.computed)
+
+    def _curves(self) -> Iterator[Curves]:
         flat = self.values.reshape(-1)
         if ORDER * flat.size > _LARGEST:
             return
@@ -69,8 +73,7 @@ class Quantity:
             places = groups_in_words(index, {self.name: flat}) if not self.coded else ()
             yield Curves(f"by value of {self.name}", grouped(index), plain=True, places=places)
         if self.ordered:
-            for found in over_column(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size)):
-                yield replace(found, computed=self.computed)
+            yield from over_column(self.name, flat, min(_FINEST_OVER, _LARGEST // flat.size))
 
 
 def quantity(name: str, axes: Sequence[str], values: np.ndarray) -> Quantity | None:

@@ -40,6 +40,7 @@ class SiteFinding:
         place: in words, of the one entry that brings most of what is wrong; None where several do.
         whereabouts: the pattern, where it says where or along what something is wrong.
         is_ripple: whether it varies in ripples, which find any reading that is far off.
+        is_of_each: whether it varies from reading to reading, which finds them, too.
     """
 
     site: str
@@ -53,6 +54,7 @@ class SiteFinding:
     place: str | None = None
     whereabouts: str | None = None
     is_ripple: bool = False
+    is_of_each: bool = False
 
     @property
     def family(self) -> str:
@@ -116,24 +118,26 @@ def likely_left(found: Iterable[SiteFinding]) -> float:
 def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFinding]:
     """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong.
 
-    Ripples of a spread come last where tails are what is wrong: the finest ones find any reading that is far off.
+    Ripples of a spread, and what varies from reading to reading, come last where tails or skewness are what is wrong: they
+    find any reading that is far off.
 
     Readings themselves come last where a site stands for some of them, unless they are more than twice as surely wrong.
 
     Where p-values end values come last if their scores are no larger than noise of such an energy (of the residuals, over
     its expectation) makes them.
     """
-    of_values = min((f.p_value for f in findings if f.is_of_values), default=1.0)
+    strays = any(f.moment in ("tails", "skewness") and f.p_value <= _FAR_READINGS for f in findings)
+    steady = [f for f in findings if f.is_of_values and not (strays and f.is_of_each)]
+    of_values = min((f.p_value for f in steady), default=1.0)
     of_moments = min((f.p_value for f in findings if not f.is_of_values), default=1.0)
-    score = max((f.score for f in findings if f.is_of_values), default=0.0)
+    score = max((f.score for f in steady), default=0.0)
     by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
-    of_sites = min((f.p_value for f in findings if f.is_of_values and not f.is_inline), default=1.0)
-    strays = any(f.moment == "tails" and f.p_value <= _FAR_READINGS for f in findings)
+    of_sites = min((f.p_value for f in steady if not f.is_inline), default=1.0)
     return [
         replace(
             f,
             last=(of_values <= SURE and f.is_of_values == by_noise and not f.repeats)
-            or (strays and f.is_ripple and not f.is_of_values)
+            or (strays and ((f.is_ripple and not f.is_of_values) or f.is_of_each))
             or (f.is_inline and of_sites <= SURE and f.p_value >= of_sites**2),
         )
         for f in findings

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+import functools
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -34,6 +35,8 @@ class Suspect:
         family: what is added to the site, and how it varies.
         spread: standard deviation of the weights with the largest evidence.
         evidence: log Bayes factor of that spread against none, to first order, each weight apart.
+        steady: the same if the site's scores scatter as much as they do in the data, which what is wrong elsewhere makes
+            them: the order in which ways of varying a site are looked at.
         price: logarithm of how many ways of varying the site it was picked from.
     """
 
@@ -42,6 +45,7 @@ class Suspect:
     family: Family
     spread: float
     evidence: float
+    steady: float
     price: float
 
 
@@ -50,9 +54,30 @@ def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
     # no parameter that all distributions have moves their shape
     moved = [test for test in tests if test.family.kind != "shape" and test.variance.size <= _MOST_WEIGHTS]
     choice = float(np.log(max(len(moved), 1)))
-    found = [_suspect(site, test, choice) for test in moved if _overlapping(test.family.pattern) is None]
-    found += [_suspect(site, narrow, choice, band) for test in moved for narrow, band in _narrowed(test)]
-    return sorted((s for s in found if s is not None), key=lambda s: -s.evidence)[:_MOST_SUSPECTS]
+    scatter = {kind: _scatter(tests, kind) for kind in {test.family.kind for test in moved}}
+    one = functools.partial(_suspect, site, scatter, choice)
+    found = [one(test) for test in moved if _overlapping(test.family.pattern) is None]
+    found += [one(narrow, band) for test in moved for narrow, band in _narrowed(test)]
+    ordered = sorted((suspect for suspect in found if suspect is not None), key=lambda s: -s.steady)
+    each = [
+        i for i, s in enumerate(ordered) if s.family.pattern.curves is None
+    ]  # their scatter is what they say
+    most = max(each, key=lambda i: ordered[i].evidence, default=0)
+    kept = ordered[:_MOST_SUSPECTS]
+    return kept if most < _MOST_SUSPECTS else [*kept[:-1], ordered[most]]
+
+
+def _scatter(tests: Sequence[FamilyTest], kind: str) -> float:
+    """Squared scores of a site's entries over their variance, on average; at least 1.
+
+    A spread that is wrong by a factor, or a few far readings, make the scores of all families larger than replicates know.
+    Random weights would have more evidence the more of them there are, whatever they follow.
+    """
+    each = [t for t in tests if t.family.kind == kind and t.family.pattern.curves is None]
+    finest = max(each, key=lambda t: len(t.variance), default=None)
+    if finest is None or not finest.seen.any():
+        return 1.0
+    return max(float(finest.told[finest.seen].mean()), 1.0)
 
 
 def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
@@ -63,26 +88,27 @@ def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
     computes. What varies over positions (a ripple, a cycle, each
     position by itself) is told by the column that it follows, where there is one.
     """
+    evidence = functools.partial(_evidence, scatter=_scatter(tests, surest.family.kind))
     pattern, most = surest.family.pattern, _NEARLY * np.log(max(surest.p_value, _FARTHEST))
     alike = [t for t in tests if t.family.kind == surest.family.kind and np.log(t.p_value) <= most]
     if _overlapping(pattern) is not None:
         few = [t for t in alike if len(t.variance) <= _FEW or _overlapping(t.family.pattern) is not None]
-        best = max(few, key=_evidence)
-        told = max((t for t in few if not _is_computed(t.family.pattern)), key=_evidence, default=best)
-        return told if _evidence(told) >= _NEARLY * _evidence(best) else best
+        best = max(few, key=evidence)
+        told = max((t for t in few if _is_of_data(t.family.pattern)), key=evidence, default=best)
+        return told if evidence(told) >= _NEARLY * evidence(best) else best
     if pattern.kept and not _is_plain(pattern):
-        plain = max((t for t in alike if _is_plain(t.family.pattern)), key=_evidence, default=surest)
-        return plain if _evidence(plain) >= _NEARLY * _evidence(surest) else surest
+        plain = max((t for t in alike if _is_plain(t.family.pattern)), key=evidence, default=surest)
+        return plain if evidence(plain) >= _NEARLY * evidence(surest) else surest
     return surest
 
 
-def _evidence(test: FamilyTest) -> float:
+def _evidence(test: FamilyTest, scatter: float) -> float:
     """Log Bayes factor of random weights of a family, of the best place alone where its curves overlap."""
     curves = _overlapping(test.family.pattern)
     if curves is None:
-        return common_spread(test.first[0], test.variance)[1]
+        return common_spread(test.first[0], scatter * test.variance)[1]
     place, chances = _at_best_place(test, curves)
-    return common_spread(place.first[0], place.variance)[1] - chances
+    return common_spread(place.first[0], scatter * place.variance)[1] - chances
 
 
 def _at_best_place(test: FamilyTest, curves: Curves) -> tuple[FamilyTest, float]:
@@ -102,9 +128,9 @@ def _is_plain(pattern: Pattern) -> bool:
     return pattern.curves is not None and pattern.curves.plain
 
 
-def _is_computed(pattern: Pattern) -> bool:
-    """Whether a pattern follows what the model computes."""
-    return pattern.curves is not None and pattern.curves.computed
+def _is_of_data(pattern: Pattern) -> bool:
+    """Whether a pattern follows columns of the data, or nothing, and not what the model computes or mere positions."""
+    return pattern.curves is None or pattern.curves.of_data
 
 
 def _overlapping(pattern: Pattern) -> Curves | None:
@@ -144,10 +170,12 @@ def _narrowed(test: FamilyTest) -> Iterator[tuple[FamilyTest, float]]:
     )
 
 
-def _suspect(site: Site, test: FamilyTest, choice: float, band: float = 0.0) -> Suspect | None:
+def _suspect(
+    site: Site, scatter: Mapping[str, float], choice: float, test: FamilyTest, band: float = 0.0
+) -> Suspect | None:
     """A tested family as a suspect, if its evidence less the price of its band speaks for it."""
     spread, evidence = common_spread(test.first[0], test.variance)
-    evidence -= band
-    return (
-        Suspect(site.name, site.rows, test.family, spread, evidence, choice + band) if evidence > 0 else None
-    )
+    if evidence <= band:
+        return None
+    steady = common_spread(test.first[0], scatter[test.family.kind] * test.variance)[1] - band
+    return Suspect(site.name, site.rows, test.family, spread, evidence - band, steady, choice + band)

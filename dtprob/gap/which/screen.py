@@ -83,6 +83,11 @@ class Screening:
         """Whether the scores show a gap at their half of the level."""
         return float(self.adjusted.min(initial=1.0)) <= settings.level / 2
 
+    def pays_for(self, name: str, most: float, settings: Settings) -> bool:
+        """Whether a candidate's score shows a gap at its half of the level, or another's that tells of no more nats."""
+        shown = self.adjusted <= settings.level / 2
+        return bool((shown & ((np.array(self.names) == name) | (self.z**2 / 2 <= most))).any())
+
 
 def screen(
     problem: Problem,

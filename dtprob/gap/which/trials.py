@@ -33,6 +33,8 @@ _FIELD_NATS: Final = 3.0
 """Nats that it has to be better by in any case."""
 _SURE: Final = 3.0
 """Nats that an effect has to bring where its score does not show it, beside those of the choice among all."""
+_TOLD: Final = 0.5
+"""Share of the nats that another candidate's score tells of that an effect has to bring to be what rang that alarm."""
 _LIVE: Final = 12
 """Effects that are live at once, at most, where fewer are wanted."""
 _HOPELESS: Final = 0.05
@@ -190,16 +192,18 @@ def _log_sets(candidates: int, size: int) -> float:
 def best(seen: View, base: fitting.Fit, trials: Mapping[str, fitting.Fit], settings: Settings) -> str | None:
     """The refit of most credit, if the choice among all candidates has been paid for and it is no minor matter.
 
-    The family-wise level of the scores pays; where only the sites have rung the alarm the evidence has to.
+    The family-wise level of its score pays, or that of another candidate whose score tells of no more than twice what the
+    refit gains: that one may have stood for it. Else, as where only the sites have rung the alarm, the evidence has to.
     """
     if not trials:
         return None
     fitted = seen.fitted
     chosen = max(trials, key=lambda name: credit(seen.problem, trials[name], base))
     so_far = fitted.log_evidence - base.log_evidence
-    paid = seen.screening.shows_gap(settings)
+    gained = trials[chosen].log_evidence - fitted.log_evidence
+    paid = seen.screening.pays_for(chosen, gained / _TOLD, settings)
     needed = max(0.0 if paid else np.log(len(seen.problem.effects)) + _SURE, settings.minor * so_far)
-    return chosen if trials[chosen].log_evidence - fitted.log_evidence > needed else None
+    return chosen if gained > needed else None
 
 
 def _scanned_start(problem: Problem, scanned: Problem, effect: Effect, found: Found) -> np.ndarray:

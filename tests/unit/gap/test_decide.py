@@ -1,6 +1,7 @@
 """The verdict that follows from what was accepted, what it closes and what is left."""
 
 from types import SimpleNamespace
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.settings import Settings
 from dtprob.gap.where.site_finding import SiteFinding
+from dtprob.gap.which.screen import Screening
 from dtprob.gap.which.trials import Start, Trials, best, credit
 
 
@@ -103,8 +105,20 @@ def test_no_cause_is_unlisted_where_a_site_is_wrong():
 
 def seen(problem, fitted, adjusted):
     """What `best` looks at: a fit, and the smallest family-wise p-value of the scores there."""
-    screening = SimpleNamespace(shows_gap=lambda settings: adjusted <= settings.level / 2)
+    screening = SimpleNamespace(pays_for=lambda name, most, settings: adjusted <= settings.level / 2)
     return SimpleNamespace(problem=problem, fitted=fitted, screening=screening)
+
+
+@pytest.mark.parametrize(
+    ("name", "most", "paid"),
+    [("a", 0.1, True), ("b", 0.1, False), ("b", 17.0, False), ("b", 19.0, True), ("c", 100.0, True)],
+)
+def test_an_alarm_pays_for_the_effect_that_rang_it_and_for_what_gains_as_much(name, most, paid):
+    """The score of one candidate tells of 18 nats: one that brings one nat did not ring that alarm."""
+    screening = SimpleNamespace(
+        names=("a", "b", "c"), adjusted=np.array([1e-7, 0.9, 0.3]), z=np.array([6.0, 1.0, 1.0])
+    )
+    assert Screening.pays_for(cast("Any", screening), name, most, Settings()) == paid
 
 
 @pytest.mark.parametrize(

@@ -114,3 +114,14 @@ def test_ripples_of_a_spread_follow_far_readings(pattern: str, p_of_tails: float
     assert [f.last for f in found if f.moment != "tails"] == [not is_first] * 2
     assert [f.can_be_modelled for f in found if f.moment != "tails"] == [is_first] * 2
     assert not any(f.can_be_modelled for f in found if f.moment == "tails")
+
+
+@pytest.mark.parametrize(("moment", "p", "is_first"), [("skewness", 1e-16, False), ("tails", 1e-6, True)])
+def test_what_varies_from_reading_to_reading_follows_far_readings(
+    moment: str, p: float, is_first: bool
+) -> None:
+    """Delays that are now and then far too late: an amount of its own for each reading says no more than that."""
+    each = SiteFinding("m", "additive", "packet", 1e-66, 90.0, is_of_each=True)
+    law = SiteFinding("delay", moment, "common", p, None)
+    found = sorted(shadows_last([each, law], 1.0), key=rank)
+    assert (found[0].site == "m") == is_first

@@ -130,3 +130,37 @@ def test_a_column_is_named_only_where_it_is_nearly_as_evident(score, is_told, ri
     wave = FamilyTest(family_of(ripples.band(0, 1)), 1e-14, np.ones(9), np.full((9, 1), 10.0), np.ones(1))
     lane = FamilyTest(family_of(lanes), 1e-13, np.ones(9), np.full((9, 4), score), np.ones(4))
     assert plainest(wave, [wave, lane]) is (lane if is_told else wave)
+
+
+def test_a_place_is_told_over_a_column_sooner_than_over_what_the_model_computes():
+    """Distance and the level that the twin computes of it show the same shadow; only the first was measured."""
+    scores = np.random.default_rng(1).normal(size=(50, 8))
+    scores[0, 3] = 12.0
+    of_model = Curves("between two values of mean", np.eye(8), overlaps=True, places=("mean",) * 8)
+    of_data = dataclasses.replace(of_model, places=("distance",) * 8, of_data=True)
+    computed, measured = (family_test(family_of(c), scores) for c in (of_model, of_data))
+    assert plainest(computed, [computed, measured]).pattern == "distance"
+    weak = measured._replace(first=0.5 * measured.first)
+    assert plainest(computed, [computed, weak]).pattern == "mean"
+
+
+def test_a_common_scale_is_the_first_suspect_where_it_makes_all_scores_scatter():
+    """Residuals of twice the spread: 64 ripples of their squares have more evidence to first order, and say nothing."""
+    rng = np.random.default_rng(4)
+    rows = rng.normal(size=(200, 600))
+    rows[0] *= 2.0
+    each, wave = (rows**2 - 1) / 2**0.5, np.cos(np.pi * np.outer(np.arange(200, 264), np.linspace(0, 1, 600)))
+    kinds = {
+        "common": (None, each.sum(1, keepdims=True)),
+        "ripple": (Curves("ripple", wave), each @ wave.T),
+        "each": (None, each),
+    }
+    tests = [
+        family_test(Family("spread", Pattern(label, (0,), found), np.ones(())), scores)
+        for label, (found, scores) in kinds.items()
+    ]
+    found = {s.family.pattern.label: s for s in suspects(SITE, tests)}
+    assert found["ripple"].evidence > 30
+    assert found["common"].steady > 10
+    assert found["ripple"].steady < 1
+    assert next(iter(found)) == "common"
