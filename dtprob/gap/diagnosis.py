@@ -70,6 +70,10 @@ class Diagnosis:
     sections: Mapping[str, Any]
     maps: Mapping[str, xr.Dataset]
 
+    def __repr__(self) -> str:
+        """Verdict and summary."""
+        return f"Diagnosis({self.verdict}: {self.summary})"
+
     def to_report(self) -> dict[str, Any]:
         """The content of report.json."""
         report = {

@@ -83,6 +83,14 @@ class Posterior:
             remedy = "Lay every site out as (chain, draw, *event)"
             raise InputError("draws of a posterior", "one common number of chains and draws", got, remedy)
 
+    def __repr__(self) -> str:
+        """Engine, chains and draws, and each latent site with its shape."""
+        engine = self.provenance.get("engine", "draws")
+        latent = ", ".join(
+            f"{n} {self.draws[n].shape[2:]}" for n in self.latent or self.draws if n in self.draws
+        )
+        return f"Posterior({engine}: {self.chains} chains of {self.draws_per_chain}; {latent})"
+
     @property
     def chains(self) -> int:
         """Number of chains."""

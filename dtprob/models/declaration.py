@@ -250,8 +250,12 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
         remedy = "Give every parameter a proper prior; a wide one will do"
         raise InputError(what, "distributions that can be drawn from", got, remedy) from error
     except NOT_TRACED as error:
-        what, got = f"model {model_name(function)}", str(error).split("\n", maxsplit=1)[0]
-        remedy = "Use jnp.where or lax.cond for `if`, jnp for np, and give sizes as plain numbers"
+        where = f" ({place})" if (place := raised_at(error)) else ""
+        what, got = f"model {model_name(function)}{where}", str(error).split("\n", maxsplit=1)[0]
+        remedy = (
+            "Use jnp.where or lax.cond for `if`, jnp for np, jnp.asarray(TABLE)[column] for a table of NumPy, a mask "
+            "(column == value) for column[column == value], and give sizes as plain numbers"
+        )
         raise InputError(what, "operations on arrays that JAX can trace", got, remedy) from error
     found = _with_lent_axes(found)
     declaration = Declaration(

@@ -12,8 +12,8 @@ from dtprob.inference.circular import arc_interval
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
 
-UNIDENTIFIED: Final = 0.1
-"""A contraction below this is that of data that say nothing."""
+UNIDENTIFIED: Final = 1 - 0.9**2
+"""A contraction below this is that of data that say nothing: nine tenths of the prior's width are left."""
 _BATCHES: Final = 8
 _MIDDLE: Final = 0.5
 
@@ -21,10 +21,11 @@ _MIDDLE: Final = 0.5
 def contraction(
     posterior: Posterior, model: Model, data: Mapping[str, Any], sites: list[str]
 ) -> dict[str, np.ndarray]:
-    """One minus the width of each entry's posterior over that of its prior: 1 is known exactly, 0 is not identified.
+    """One minus the variance of each entry's posterior over that of its prior: 1 is known exactly, 0 is not identified.
 
-    Widths are those of the middle half; a negative number means a posterior wider than the prior. An entry whose draws
-    are all the same, as a point estimate's are, has none (NaN).
+    Variances are squares of the width of the middle half, which far draws do not change; a negative number means a
+    posterior wider than the prior (Betancourt, arXiv:1803.08393). An entry whose draws are all the same, as a point
+    estimate's are, has none (NaN).
 
     Args:
         posterior: of the model on the data.
@@ -38,8 +39,11 @@ def contraction(
     prior = {name: np.concatenate([np.asarray(values[name]) for values in drawn]) for name in sites}
     return {
         name: 1
-        - _width(posterior.flat(name), circular=name in posterior.circular)
-        / _width(prior[name], circular=name in posterior.circular)
+        - (
+            _width(posterior.flat(name), circular=name in posterior.circular)
+            / _width(prior[name], circular=name in posterior.circular)
+        )
+        ** 2
         for name in sites
     }
 

@@ -24,9 +24,9 @@ def test_python_runs(block, capsys):
     exec(compile(block, "README.md", "exec"), names)  # noqa: S102  (our own text)
     numbers, verdict = capsys.readouterr().out.splitlines()
     mean, spread = map(float, numbers.split())
-    np.testing.assert_allclose(mean, 2.8, atol=3 * spread)
+    np.testing.assert_allclose(mean, 3.0, atol=3 * spread)  # 2.8 without the shadow
     assert 0.01 < spread < 0.2
-    assert verdict == "No gap was found between the twin and the data."
+    assert f"# {verdict}" in block.splitlines()
 
 
 def test_cases_are_cases():

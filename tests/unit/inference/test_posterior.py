@@ -153,3 +153,8 @@ def test_what_is_no_posterior_is_refused(tmp_path):
     tree.attrs["format"] = "dtprob posterior 99"
     with pytest.raises(InputError, match="expected format 'dtprob posterior 1'"):
         from_datatree(tree)
+
+
+def test_it_shows_itself_in_one_line():
+    shown = repr(posterior())
+    assert shown == "Posterior(nuts: 2 chains of 50; level (), phase (1, 4))"

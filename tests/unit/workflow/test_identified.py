@@ -36,12 +36,12 @@ def found():
     return posterior, contraction(posterior, line, data, list(draws))
 
 
-def test_contraction_is_one_minus_the_ratio_of_widths(found):
+def test_contraction_is_one_minus_the_ratio_of_variances(found):
     _, values = found
-    assert values["known"][0] == pytest.approx(2 / 3, abs=0.05)
+    assert values["known"][0] == pytest.approx(8 / 9, abs=0.03)
     assert np.isnan(values["known"][1])  # all draws the same
-    assert float(values["idle"]) == pytest.approx(0.0, abs=0.12)
-    assert float(values["angle"]) == pytest.approx(0.0, abs=0.12)
+    assert float(values["idle"]) == pytest.approx(0.0, abs=0.24)
+    assert float(values["angle"]) == pytest.approx(0.0, abs=0.24)
 
 
 def test_a_summary_names_what_is_not_identified(found):

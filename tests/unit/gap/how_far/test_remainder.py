@@ -3,6 +3,7 @@
 from dataclasses import replace
 from functools import partial
 from types import SimpleNamespace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +17,14 @@ from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.calibration import calibration
-from dtprob.gap.how_far.remainder import _has_to_be_positive, _without, alone, model_remainder, shortlist
+from dtprob.gap.how_far.remainder import (
+    _has_to_be_positive,
+    _held,
+    _without,
+    alone,
+    model_remainder,
+    shortlist,
+)
 from dtprob.gap.how_far.site_field import field_of
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.along import curves
@@ -66,7 +74,7 @@ def suspect(problem, label, spread=1.0, *, site="mean", kind="additive", evidenc
     """The family of a label."""
     rows = {"location": (0,), "spread": (1,)}.get(kind)
     pattern = Pattern(label, (0,), next(c for c in curves(problem, "row", N_ROW) if c.label == label))
-    return Suspect(site, rows, Family(kind, pattern, np.ones(())), spread, evidence, 0.0)
+    return Suspect(site, rows, Family(kind, pattern, np.ones(())), spread, evidence, evidence, 0.0)
 
 
 def prepared(data, model=table, cluster="street"):
@@ -152,7 +160,7 @@ def moved_as_its_families_do(problem, site, over, rng):
     """Labels of all families of a site, each of whose fields moves the site as the family's weights do."""
     seen, value = [], site.value
     for family, scores in families(partial(curves, problem), over, site):
-        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0, 0.0), positive=False)
+        effect = field_of(problem, "r[0]", Suspect("load", None, family, 0.5, 9.0, 9.0, 0.0), positive=False)
         weights = rng.normal(size=effect.shape_of_field(jnp.asarray(value), {}))
         moved = effect.rewrites["load"](value, {"scale": 2.0, FIELD: weights}, {}) - value
         assert weights.size == scores.shape[1]
@@ -248,6 +256,44 @@ def test_what_is_chance_is_not_modelled():
     assert modelled(rows(5), ["along place", "by street"])[1] is None
     problem = prepared(rows(5))[0]
     assert shortlist(problem, [suspect(problem, "along place", evidence=1.0)]) == ()
+
+
+@pytest.mark.parametrize(
+    ("gains", "kept"), [((3.0, 5.0), 1), ((3.0, -50.0), 0), ((-1.0, 2.0), 1), ((-1.0, -2.0), None)]
+)
+def test_what_predicts_no_better_is_left_out_of_the_model(gains, kept, monkeypatch):
+    """Each further term costs what it adds to the evidence, and has to predict clusters that were left out."""
+    fits = [SimpleNamespace(name=i) for i in range(2)]
+    folds = [SimpleNamespace(held=np.arange(4) == i, charged=0.0) for i in range(2)]
+    monkeypatch.setattr(closed, "fold_fits", lambda wider, full, assignment: [Refitted(full)] * 2)
+    monkeypatch.setattr(
+        closed,
+        "judged",
+        lambda wider, parts: SimpleNamespace(log_likelihood=np.array([gains[parts[0].full.name]])),
+    )
+    found = _held(None, fits, folds, SimpleNamespace(log_likelihood=np.zeros(1)))
+    assert (None if found is None else found[0].name) == kept
+
+
+class Refitted(NamedTuple):
+    full: SimpleNamespace
+    charged: float = 1.0
+
+
+def test_what_each_reading_does_by_itself_is_always_tried():
+    """Heavy tails look like an amount of its own for each reading, of which other evidence makes little."""
+    problem = prepared(rows(5))[0]
+    labels = [c.label for c in curves(problem, "row", N_ROW) if c.extent[0] <= 16][:8]
+    some = [
+        replace(suspect(problem, label, evidence=10.0), steady=10.0 - i) for i, label in enumerate(labels)
+    ]
+    each = replace(suspect(problem, labels[0], evidence=900.0), steady=0.0)
+    each = replace(each, family=Family("spread", Pattern("row", (0,)), np.ones(())), site="y", rows=(1,))
+    found = shortlist(problem, [*some, each])
+    assert len(found) == 6
+    assert [s.steady for s in found] == [10.0, 0.0, 9.0, 8.0, 7.0, 6.0]
+    last = shortlist(problem, [*some, replace(each, site="mean", rows=None)])
+    assert [s.steady for s in last] == [10.0, 9.0, 8.0, 7.0, 6.0, 0.0]
 
 
 def test_one_thing_under_two_names_is_tried_once():

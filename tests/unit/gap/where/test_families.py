@@ -13,7 +13,7 @@ from dtprob.gap.model.inline import unnamed
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.where.along import curves
 from dtprob.gap.where.curves import Curves, cycles, grouped
-from dtprob.gap.where.families import deterministic, families, observed, shifted
+from dtprob.gap.where.families import Family, Pattern, Summed, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import family_test
 from dtprob.gap.where.quantities import Quantity, groups, quantity
 from tests.unit.gap.examples import bend, draw, line
@@ -229,7 +229,7 @@ def test_a_quantity_lies_on_the_axes_along_which_it_varies():
 
 def test_curves_over_a_quantity_are_smooth_in_its_rank_and_ripples_over_its_values():
     values = np.random.default_rng(0).lognormal(size=(LENGTH, 3))
-    smooth, steps, between, *ripples = quantity("delay", ("link", "path"), values).curves()
+    smooth, steps, bends, between, *ripples = quantity("delay", ("link", "path"), values).curves()
     order = np.argsort(values.reshape(-1))
     assert smooth.label == "along delay"
     assert np.all(np.diff(smooth.values[0][order]) < 0)
@@ -237,6 +237,11 @@ def test_curves_over_a_quantity_are_smooth_in_its_rank_and_ripples_over_its_valu
     assert steps.places[7] == f"beyond {np.median(values):.4g} of delay"
     assert np.all(np.diff(steps.values[:, order]) >= 0)
     np.testing.assert_allclose(steps.values.mean(1), 0.5 - np.arange(1, 16) / 16, atol=1 / values.size)
+    assert bends.label == "bend at a value of delay"
+    assert bends.places[7] == f"bend at {np.median(values):.4g} of delay"
+    bend = bends.values[7] - bends.values[7].min()
+    above = np.maximum(values.reshape(-1) - np.median(values), 0.0)
+    np.testing.assert_allclose(bend * above.std() * 2**0.5, above, atol=1e-12)
     assert between.label == "between two values of delay"
     low, high = map(float, between.places[70].removeprefix("delay ").split(" to "))
     inside = between.values[[70]].toarray()[0] > 0
@@ -322,7 +327,7 @@ def test_what_a_group_does_at_some_hours_is_noticed(turned):
     each, course = found["additive, by vendor x hour"], found["additive, smooth in hour by vendor"]
     some = found["additive, stretch of hour by vendor"]
     assert some.p_value < 1e-6 * min(each.p_value, course.p_value)
-    assert set(some.label.removeprefix("additive, ").split(", ")) == {"vendor 3", "hour 17 to 18"}
+    assert set(some.pattern.split(", ")) == {"vendor 3", "hour 17 to 18"}
     assert each.variance.shape == (200,)
     assert course.variance.shape == (20,)
     assert each.p_value < 1e-2
@@ -442,3 +447,21 @@ def test_ripples_are_no_finer_than_the_values_are_many():
     distinct = np.unique(waves, axis=1)
     assert distinct.shape[1] == 8
     assert np.linalg.matrix_rank(distinct) == 8
+
+
+def test_what_bends_at_a_value_is_told_as_a_bend():
+    """Levels that fall twice as fast beyond a breakpoint distance: a step anywhere says less."""
+    rng = np.random.default_rng(6)
+    distance = np.sort(rng.uniform(10.0, 400.0, 600))
+    scores = rng.normal(size=(200, 600))
+    scores[0] -= 0.006 * np.maximum(distance - 250.0, 0.0)
+    found = {c.label: c for c in quantity("distance", ("row",), distance).curves()}
+    tests = {
+        label: family_test(
+            Family("additive", pattern, np.ones(())), pattern.scores(Summed(scores[..., None]))
+        )
+        for label, pattern in ((n, Pattern(n, (0,), c)) for n, c in found.items())
+    }
+    bend = tests["bend at a value of distance"]
+    assert bend.p_value < min(1e-6, tests["beyond a value of distance"].p_value)
+    assert float(bend.pattern.split()[2]) == pytest.approx(250.0, abs=40.0)

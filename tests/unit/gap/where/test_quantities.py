@@ -147,7 +147,7 @@ def test_a_product_of_two_columns_is_told_from_all_others():
     pattern = Pattern(products.label, (0,), products)
     found = family_test(Family("additive", pattern, np.ones(())), pattern.scores(Summed(scores[..., None])))
     assert found.p_value < 1e-6
-    assert found.label == "additive, f1 times f5"
+    assert found.pattern == "f1 times f5"
 
 
 def test_a_group_may_differ_between_two_values_of_a_column_or_for_a_while():
