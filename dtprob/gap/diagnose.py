@@ -100,7 +100,7 @@ def diagnose(
             data,
             effects,
             key=key,
-            engine=resolve(engine),
+            engine=resolve(engine) if isinstance(engine, str) else engine,
             cluster=cluster,
             settings=settings,
             reference=reference,

@@ -17,7 +17,7 @@ _TIME: Final = re.compile(r"\d+[-/:]\d")
 """How a date or a time of day begins."""
 _PLACED: Final = (("where", "sites"), ("unlisted", "located"), ("remainder", "terms"))
 """Where a report tells of places."""
-_KEYS: Final = ("place", "family", "shape", "summary")
+_KEYS: Final = ("place", "family", "whereabouts", "shape", "summary")
 
 
 def coded(file: Path, columns: Mapping[str, Any], words: Words, taken: Collection[str]) -> dict[str, Any]:

@@ -198,9 +198,10 @@ def _test_sites(
     noise = drawn.rows if centre is None else centre.without_own(drawn.rows)  # no tail of own unknowns' prior
     for name, family, scores in further_moments(problem, fitted.x, noise):
         beyond.setdefault(name, []).append(family_test(family, scores))
+    energy = _energy(problem, drawn)
     in_all = InAll.of([t for tests in (*(own for _, own in tested), *beyond.values()) for t in tests])
     findings = [
-        _finding(problem, fitted, projection, drawn, site=site, tests=tests, in_all=in_all)
+        _finding(problem, fitted, projection, drawn, energy=energy, site=site, tests=tests, in_all=in_all)
         for site, tests in tested
     ]
     further = [_beyond(name, tests, in_all) for name, tests in beyond.items()]
@@ -269,6 +270,7 @@ def _finding(
     projection: Projection,
     drawn: Replicates,
     *,
+    energy: float,
     site: Site,
     tests: Sequence[FamilyTest],
     in_all: InAll,
@@ -278,7 +280,7 @@ def _finding(
     steps = np.stack([best.family.step(score, best.variance, site.value) for score in best.first])
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
     gain = gains(drawn.rows[: 1 + CHANCE], shifts, problem.rows.is_spread)
-    net = max(float(gain[0] - gain[1:].mean()), 0.0)
+    net, beyond = (max(float(gain[0] - e * gain[1:].mean()), 0.0) for e in (1.0, energy))
     p_value = in_all.p_value(best)
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
@@ -295,6 +297,7 @@ def _finding(
         p_value,
         net,
         spreads=spreads,
+        beyond_noise=beyond,
         score=score,
         place=place,
         whereabouts=named.whereabouts,

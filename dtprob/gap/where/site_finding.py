@@ -36,6 +36,7 @@ class SiteFinding:
             where nothing that a model computes would move it.
         last: whether it may be the shadow of another: a wrong mean spreads too, and far strays look like wrong means.
         spreads: whether moving the site moves nothing but spreads of observations.
+        beyond_noise: nats of the gain beyond those that noise of the residuals' energy would bring by chance.
         score: squared score of its values over the variance, on average over the entries of the family that has most.
         place: in words, of the one entry that brings most of what is wrong; None where several do.
         whereabouts: the pattern, where it says where or along what something is wrong.
@@ -50,6 +51,7 @@ class SiteFinding:
     gain: float | None
     last: bool = False
     spreads: bool = False
+    beyond_noise: float = 0.0
     score: float = math.inf
     place: str | None = None
     whereabouts: str | None = None
@@ -118,6 +120,8 @@ def likely_left(found: Iterable[SiteFinding]) -> float:
 def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFinding]:
     """Where values are surely wrong moments come last, or the values if a moment is more than twice as surely wrong.
 
+    Not if that moment gains less: a level that is far off makes squares larger than all noise, and explains them better.
+
     Ripples of a spread, and what varies from reading to reading, come last where tails or skewness are what is wrong: they
     find any reading that is far off.
 
@@ -129,7 +133,9 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
     strays = any(f.moment in ("tails", "skewness") and f.p_value <= _FAR_READINGS for f in findings)
     steady = [f for f in findings if f.is_of_values and not (strays and f.is_of_each)]
     of_values = min((f.p_value for f in steady), default=1.0)
-    of_moments = min((f.p_value for f in findings if not f.is_of_values), default=1.0)
+    explained = max((f.beyond_noise for f in steady), default=0.0)
+    moments = (f for f in findings if not f.is_of_values and (f.gain is None or f.gain > explained))
+    of_moments = min((f.p_value for f in moments), default=1.0)
     score = max((f.score for f in steady), default=0.0)
     by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
     of_sites = min((f.p_value for f in steady if not f.is_inline), default=1.0)

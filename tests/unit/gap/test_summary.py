@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import pytest
 
 from dtprob.gap.compose import summary
+from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.located import site_shares, unlisted
 from dtprob.gap.where.locate import Location
 from dtprob.gap.where.site_finding import SiteFinding
@@ -54,9 +55,13 @@ def test_a_gap_within_the_tolerance_is_a_gap():
 
 @pytest.mark.parametrize(("effects", "said"), [(("a",), "a imitates"), (("a", "b"), "a and b imitate")])
 def test_what_imitates_part_of_an_unknown_cause_is_said(effects, said):
-    cause = SimpleNamespace(effects=effects, alias_class=(effects,), closed_fraction=None)
+    cause = SimpleNamespace(
+        effects=effects, alias_class=(effects,), closed_fraction=ClosedFraction(0.4, 0.2, 0.6)
+    )
     evidence = SimpleNamespace(after=Location((), (), {}, 1e-9), problem=SimpleNamespace(effects=("a", "b")))
     assert summary("UNLISTED", (cause,), evidence).endswith(f" {said} part of it.")
+    cause.closed_fraction = None  # not established that it closes anything
+    assert "part of it" not in summary("UNLISTED", (cause,), evidence)
 
 
 def test_shares_are_of_a_gap_and_of_what_can_be_moved():

@@ -145,10 +145,16 @@ def test_places_are_called_by_their_words(place, said):
 
 
 def test_so_are_ways_to_vary():
-    report = {"where": {"sites": [{"family": "spread, site 2, distance 3 to 5", "p_value": 0.1}]}}
+    report = {
+        "where": {
+            "sites": [{"family": "spread, site 2, distance 3 to 5", "whereabouts": "site 2, distance 3 to 5"}]
+        }
+    }
     report["remainder"] = {"terms": [{"shape": "additive, along distance by site", "weights": 3}]}
     found = spelled(report, {"site": SITES})
-    assert found["where"]["sites"] == [{"family": "spread, site tower, distance 3 to 5", "p_value": 0.1}]
+    assert found["where"]["sites"] == [
+        {"family": "spread, site tower, distance 3 to 5", "whereabouts": "site tower, distance 3 to 5"}
+    ]
     assert found["remainder"] == report["remainder"]
     assert spelled({**report, "remainder": None}, {"site": SITES})["remainder"] is None
 
@@ -165,7 +171,9 @@ def test_a_diagnosis_speaks_of_words(tmp_path):
     report = json.loads((out / "report.json").read_text())
     assert report["verdict"] == "UNLISTED"
     assert report["provenance"]["words"] == {"site": list(SITES)}
-    assert any("site tower" in site.get("place", "") for site in report["where"]["sites"])
+    told = [site.get(key, "") for site in report["where"]["sites"] for key in ("place", "whereabouts")]
+    assert any("site tower" in words for words in told)
+    assert not any("site 2" in words for words in told)
     page = (out / "report.html").read_text()
     assert "site tower" in page
     assert page.count("harbour") > 1  # the places of the picture along the column

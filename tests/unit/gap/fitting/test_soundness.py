@@ -13,8 +13,9 @@ from dtprob.errors import InputError
 from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting.at_end import at_end, shared_draws
 from dtprob.gap.fitting.base import fit_base
-from dtprob.gap.fitting.soundness import UNSEEN, check_noise, idle, lopsided, notes
+from dtprob.gap.fitting.soundness import check_noise, idle, lopsided, notes
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.vocabulary import UNSEEN
 from dtprob.inference import Laplace
 from tests.unit.gap.examples import bend, draw, inputs, line
 from tests.unit.test_cli import CASE, EFFECTS, MODEL

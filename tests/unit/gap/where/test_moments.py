@@ -119,7 +119,7 @@ def recurring(seed):
         pytest.param(recurring, "y", "dependence on those 2 before along time", marks=pytest.mark.study),
         (skewed, "y", "skewness"),
         (heavy, "z", "spread"),  # of single entries, and tails
-        (remembered, "y", "dependence along time"),
+        (remembered, "y", "dependence on the one before along time"),
         pytest.param(across, "z", "dependence from output to output", marks=pytest.mark.study),
         (shared, "y", "dependence on z"),
     ],
@@ -189,7 +189,7 @@ def test_what_goes_together_leaves_what_its_chance_tells_unless_it_is_a_shadow()
     assert most_left([values, together]) == pytest.approx(20 * np.log(10))
     assert most_left([values, replace(together, last=True)]) == 12.0
     assert most_left([]) == 0.0
-    small = replace(values, family="spread, by group", p_value=1e-40, gain=12.0)
+    small = replace(values, kind="spread", pattern="by group", p_value=1e-40, gain=12.0)
     assert most_left([small]) == pytest.approx(40 * np.log(10))
 
 

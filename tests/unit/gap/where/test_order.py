@@ -54,6 +54,14 @@ def test_a_site_that_only_spreads_comes_after_values_that_are_surely_wrong(of_sp
     assert min(shadows_last([deviation, mean], 4.0), key=lambda found: found.last).site == first
 
 
+@pytest.mark.parametrize(("beyond", "first"), [(85.0, "mean"), (5.0, "y")])
+def test_a_level_that_is_far_off_is_no_noise_however_large_its_squares(beyond, first):
+    """One of twelve devices off by three deviations: the squares are surer than the level, and explained by it."""
+    mean = SiteFinding("mean", "additive", "device", 1e-21, 90.0, beyond_noise=beyond)
+    spread = SiteFinding("y", "spread", "device", 1e-90, 67.0)
+    assert min(shadows_last([spread, mean], 1.75), key=rank).site == first
+
+
 @pytest.mark.parametrize(("score", "first"), [(40.0, "spread"), (200.0, "mean")])
 def test_where_p_values_end_values_with_scores_that_noise_makes_come_last(score, first):
     """Noise of four times the energy makes squared scores of four on average, and some of 40 among many."""
