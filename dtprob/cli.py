@@ -187,11 +187,11 @@ def _run(command: str, step: str, options: dict[str, Any], stopping: Stopping, *
         getattr(importlib.import_module(COMMANDS[command]), step)(**options)
     except BrokenPipeError:
         unread()
-    except InputError as error:
-        return _fail(WRONG_INPUT, str(error), debug=debug)
     except Exception as error:  # noqa: BLE001  (the one place where any failure becomes one line)
         if stopping.asked is not None:  # what the signal raised was made something else of
             stopping.again()
+        if isinstance(error, InputError):
+            return _fail(WRONG_INPUT, str(error), debug=debug)
         text = f"{command} failed: {type(error).__name__}: {str(error) or 'no message'}".rstrip(".")
         place = f" (in {where})" if (where := raised_at(error)) else ""
         return _fail(FAILED, f"{text}{place}. See how it came there with --debug.", debug=debug)

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import signal
+import sys
 from typing import Any, Final, NoReturn, Self
 
 from dtprob.errors import Terminated
 
 TERMINATED: Final = 143
 """Exit status of a process that was asked to end by SIGTERM."""
-_ALARM: Final = (signal.SIGALRM,) if hasattr(signal, "SIGALRM") else ()
-"""What reminds of it; Windows has none."""
 _AGAIN: Final = 5.0
-"""Seconds after which what was asked for is raised again, and again: enough for what cleans up."""
+"""Seconds after which what was asked for is raised again, and again, unless it has arrived."""
 
 
 class Stopping:
@@ -26,16 +25,22 @@ class Stopping:
     """
 
     asked: int | None = None
+    _alarm: tuple[Any, tuple[float, float]] | None = None
 
     def __enter__(self) -> Self:
         """Handle both signals."""
-        heard = (n for n in (signal.SIGINT, signal.SIGTERM) if signal.getsignal(n) is not signal.SIG_IGN)
-        self._former = {n: signal.signal(n, self._stop) for n in (*heard, *_ALARM)}
+        numbers = (signal.SIGINT, signal.SIGTERM)
+        heard = [n for n in numbers if signal.getsignal(n) not in (signal.SIG_IGN, None)]
+        self._former = {n: signal.signal(n, self._stop) for n in heard}
         return self
 
     def __exit__(self, *_: object) -> None:
         """Handle them as before."""
-        self._remind(0.0)
+        if self._alarm is not None:
+            handler, timer = self._alarm
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, handler)
+            signal.setitimer(signal.ITIMER_REAL, *timer)
         for number, handler in self._former.items():
             signal.signal(number, handler)
 
@@ -45,11 +50,16 @@ class Stopping:
             raise KeyboardInterrupt
         raise Terminated(TERMINATED)
 
-    def _stop(self, number: int, _: Any) -> NoReturn:
-        self.asked = number if self.asked is None else self.asked
-        self._remind(_AGAIN)
+    def _stop(self, number: int, _: Any) -> None:
+        if self.asked is None:
+            self.asked = number
+            if hasattr(signal, "SIGALRM"):  # Windows has none
+                former = signal.signal(signal.SIGALRM, self._remind)
+                self._alarm = former, signal.setitimer(signal.ITIMER_REAL, _AGAIN, _AGAIN)
         self.again()
 
-    def _remind(self, seconds: float) -> None:
-        if _ALARM:
-            signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
+    def _remind(self, *_: object) -> None:
+        if not isinstance(
+            sys.exception(), (KeyboardInterrupt, Terminated)
+        ):  # else what it raised is cleaning up
+            self.again()

@@ -195,10 +195,11 @@ class Loop:
     ) -> tuple[Chain, list[dict[str, np.ndarray]]]:
         """A group of chains after steps `begin` to `end`, and these steps' rows, by one program for every chunk."""
         blocks: list[dict[str, np.ndarray]] = []
-        for first in range(begin, end, most):
-            rows = min(most, end - first)
-            chains, block = move(chains, keys, first, first + rows, self.inputs)
-            blocks.append({name: np.asarray(x)[:, :rows] for name, x in block.items()})
+        with jax.enable_x64(self.inputs.location.dtype == np.float64):  # a thread has a precision of its own
+            for first in range(begin, end, most):
+                rows = min(most, end - first)
+                chains, block = move(chains, keys, first, first + rows, self.inputs)
+                blocks.append({name: np.asarray(x)[:, :rows] for name, x in block.items()})
         return chains, blocks
 
     def _chunk_end(self, done: int, length: int) -> int:

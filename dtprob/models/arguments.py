@@ -79,10 +79,11 @@ def doubled(data: Data) -> dict[str, Any]:
     """Data whose real and complex arrays are in double precision; call it where that is enabled."""
 
     def wider(leaf: Any) -> Any:
-        is_narrow = isinstance(leaf, _ARRAYS) and leaf.dtype in (np.float32, np.complex64)
-        return leaf.astype(np.promote_types(leaf.dtype, np.float64)) if is_narrow else leaf
+        if not isinstance(leaf, _ARRAYS) or not jax.numpy.issubdtype(leaf.dtype, jax.numpy.inexact):
+            return leaf
+        return leaf.astype(complex if jax.numpy.issubdtype(leaf.dtype, jax.numpy.complexfloating) else float)
 
-    return jax.tree.map(wider, dict(data))
+    return {name: jax.tree.map(wider, entry) for name, entry in data.items()}
 
 
 def _column(name: str, entry: Any) -> Any:

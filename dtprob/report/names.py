@@ -60,6 +60,7 @@ _WAYS: Final = {
     **dict.fromkeys(("by", "along", "over", "beyond", "between", "near"), "{whole}"),
     **{part: f"from {part} to {{whole}}" for part in ("stretch", "block")},
     "product": "with the {whole}",
+    "bend": "with a {whole}",
 }
 """How a way of varying is told, by its first word."""
 

@@ -497,3 +497,35 @@ def test_a_signal_that_is_ignored_stays_so():
             signal.raise_signal(signal.SIGINT)
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_what_cleans_up_after_a_signal_is_left_alone(number, monkeypatch):
+    """The reminder is for what was lost; an alarm of whoever calls is his again afterwards."""
+    monkeypatch.setattr(stopping, "_AGAIN", 0.05)
+    heard: list[int] = []
+    former = signal.signal(signal.SIGALRM, lambda number, _: heard.append(number))
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    signal.setitimer(signal.ITIMER_REAL, 600.0)
+    finished = False
+
+    def ask() -> None:
+        nonlocal finished
+        with stopping.Stopping():
+            try:
+                signal.raise_signal(number)
+            finally:
+                time.sleep(0.3)
+                finished = True
+
+    try:
+        with pytest.raises(KeyboardInterrupt if number == signal.SIGINT else Terminated):
+            ask()
+        assert finished
+        assert signal.getitimer(signal.ITIMER_REAL)[0] > 500
+        signal.raise_signal(signal.SIGALRM)
+        assert heard == [signal.SIGALRM]
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.signal(signal.SIGALRM, former)
+        signal.signal(signal.SIGINT, before)

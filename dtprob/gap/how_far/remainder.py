@@ -66,7 +66,7 @@ class Remainder:
 
     Attributes:
         terms: of the model, the one with the most evidence first.
-        closed: share of what the causes leave that it closes.
+        closed: share of what the causes leave that it closes; below zero if it makes predictions worse.
         held: held-out results with it.
         before, after: calibration of the predictions without and with it.
         beside: log evidence that the causes bring beside it; infinite where there are none.
@@ -83,9 +83,7 @@ class Remainder:
 def model_remainder(
     view: View, folds: Sequence[Fold], held: HeldOut, best: float, key: jax.Array
 ) -> Remainder | None:
-    """Model what a fit leaves, and judge the model on held-out clusters.
-
-    None where nothing can be modelled, or where no part of the model predicts clusters that were left out better.
+    """Model what a fit leaves, and judge the model on held-out clusters; None where nothing can be modelled.
 
     Args:
         view: the fit with the accepted effects, and the families that are suspected there.
@@ -99,10 +97,10 @@ def model_remainder(
     if not named:
         return None
     wider, fitted = _wider(view, named)
-    found = _held(wider, _forward(wider, fitted, tuple(named)), folds, held)
-    if found is None:
+    fits = _forward(wider, fitted, tuple(named))
+    if not fits:
         return None
-    full, parts, after = found
+    full, parts, after = _held(wider, fits, folds, held)
     taken = sorted((n for n in named if n in full.effects), key=lambda n: -named[n].evidence)
     reached = max(float(after.log_likelihood.sum()), float(held.log_likelihood.sum()))
     size = sum(shared_weights(wider, full, n) for n in taken)
@@ -120,17 +118,19 @@ def model_remainder(
 
 def _held(
     wider: Problem, fits: Sequence[fitting.Fit], folds: Sequence[Fold], held: HeldOut
-) -> tuple[fitting.Fit, list[Fold], HeldOut] | None:
-    """The largest of nested fits that predicts held-out clusters better, the fits to the others, and their results."""
+) -> tuple[fitting.Fit, list[Fold], HeldOut]:
+    """The largest of nested fits that predicts held-out clusters better, else the smallest; with its folds and results."""
     assignment = np.sum([i * fold.held for i, fold in enumerate(folds)], axis=0)
-    for full in reversed(fits):
+
+    def judged(full: fitting.Fit) -> tuple[fitting.Fit, list[Fold], HeldOut]:
         refitted = closed.fold_fits(wider, full, assignment)
         # the causes are as hard to choose as they were, though here others of their families are no candidates
         parts = [part._replace(charged=fold.charged) for part, fold in zip(refitted, folds, strict=True)]
-        after = closed.judged(wider, parts)
-        if after.log_likelihood.sum() > held.log_likelihood.sum():
-            return full, parts, after
-    return None
+        return full, parts, closed.judged(wider, parts)
+
+    least = held.log_likelihood.sum()
+    better = (one for one in map(judged, reversed(fits[1:])) if one[2].log_likelihood.sum() > least)
+    return next(better, None) or judged(fits[0])
 
 
 def _without(wider: Problem, full: fitting.Fit, causes: Sequence[str]) -> float:
@@ -173,7 +173,7 @@ def alone(view: View, least: float, begun: Callable[[], None] = lambda: None) ->
     promising = [s for s in view.location.suspects if s.evidence - s.price > enough]
     shared = [s for s in promising if not is_per_cluster(problem, s)]
     apart = {(s.site, round(s.evidence, 3)): s for s in shared if size_of(problem, s) <= _WEIGHTS}
-    named = _named(_site_by_site(list(apart.values()))[:_TRIED])
+    named = _named(_tried(list(apart.values())))
     if not named:
         return
     begun()
@@ -230,10 +230,21 @@ def shortlist(problem: Problem, suspects: Sequence[Suspect]) -> tuple[Suspect, .
         size = 0 if is_per_cluster(problem, suspect) else size_of(problem, suspect)
         label = suspect.family.pattern.label
         known = [s for s in chosen if s.family.pattern.label == label]
-        same = any(s.site == suspect.site or suspect.evidence > _SAME * s.evidence for s in known)
+        same = any(s.site == suspect.site or _are_alike(s, suspect) for s in known)
         if suspect.evidence >= _LEAST and not same and size <= _WEIGHTS:
             chosen.append(suspect)
-    turns = _site_by_site(chosen)
+    return _tried(chosen)
+
+
+def _are_alike(one: Suspect, other: Suspect) -> bool:
+    """Whether two families of one pattern have nearly the same evidence."""
+    less, more = sorted((one.evidence, other.evidence))
+    return less > _SAME * more
+
+
+def _tried(suspects: Sequence[Suspect]) -> tuple[Suspect, ...]:
+    """The first of them, site by site, and the one with the most evidence."""
+    turns = _site_by_site(suspects)
     most = max(range(len(turns)), key=lambda i: turns[i].evidence, default=0)
     return tuple(turns[:_TRIED] if most < _TRIED else [*turns[: _TRIED - 1], turns[most]])
 

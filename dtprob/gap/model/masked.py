@@ -9,6 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from numpyro.primitives import Messenger
 
 from dtprob.effects.changing import is_scan
@@ -49,5 +50,7 @@ def counted(model: Model, data: Data) -> Model:
 
 
 def _is_masked(message: dict[str, Any]) -> bool:
+    """Whether this is a latent site with a mask over its entries; one masked as a whole is meant to have no prior."""
     is_latent = message["type"] == "sample" and not message["is_observed"]
-    return is_latent and unwrapped(message["fn"])[1] is not None
+    mask = unwrapped(message["fn"])[1] if is_latent else None
+    return mask is not None and jnp.ndim(mask) > 0

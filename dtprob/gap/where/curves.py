@@ -127,7 +127,7 @@ def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     steps = np.where(column > cuts[:, None], 0.5, -0.5)
     places = tuple(f"beyond {cut:.4g} of {name}" for cut in cuts)
     yield Curves(f"beyond a value of {name}", steps, overlaps=True, places=places)
-    yield _bends(name, column, cuts)
+    yield from _bends(name, column, cuts[cuts > column.min()])
     yield from between(f"between two values of {name}", name, column)
     finest = min(
         finest, len(np.unique(column)) - 1
@@ -135,13 +135,14 @@ def over_column(name: str, column: np.ndarray, finest: int) -> Iterator[Curves]:
     yield from ripples(name, (column - column.min()) / np.ptp(column), finest)
 
 
-def _bends(name: str, column: np.ndarray, cuts: np.ndarray) -> Curves:
+def _bends(name: str, column: np.ndarray, cuts: np.ndarray) -> Iterator[Curves]:
     """Zero up to a value of a column (size,) and rising from there, as of what saturates, or of a breakpoint distance."""
     beyond = np.maximum(column - cuts[:, None], 0.0)
     rising = np.ptp(beyond, axis=1) > 0
-    values = np.stack([line(one) for one in beyond[rising]]) if rising.any() else np.zeros((0, len(column)))
-    places = tuple(f"bend at {cut:.4g} of {name}" for cut in cuts[rising])
-    return Curves(f"bend at a value of {name}", values, overlaps=True, places=places)
+    if rising.any():
+        values = np.stack([line(one) for one in beyond[rising]])
+        places = tuple(f"bend at {cut:.4g} of {name}" for cut in cuts[rising])
+        yield Curves(f"bend at a value of {name}", values, overlaps=True, places=places)
 
 
 def between(label: str, name: str, column: np.ndarray) -> Iterator[Curves]:

@@ -289,7 +289,8 @@ def _finding(
     if p_value <= SURE:
         named = plainest(best, tests)
         place = foremost(named, tests, site)
-    curves = best.family.pattern.curves
+    curves, parts = best.family.pattern.curves, 2 if np.iscomplexobj(site.value) else 1
+    fewest = (int(entries.sum()) for entries in problem.observed.counted.values())
     return SiteFinding(
         site.name,
         named.family.kind,
@@ -302,5 +303,5 @@ def _finding(
         place=place,
         whereabouts=named.whereabouts,
         is_ripple=curves is not None and curves.ripple is not None,
-        is_of_each=curves is None and len(best.variance) >= problem.observed.count,
+        is_of_each=curves is None and len(best.variance) // parts >= min(fewest),
     )

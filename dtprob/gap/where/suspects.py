@@ -21,6 +21,8 @@ _NEARLY: Final = 0.8
 _FEW: Final = 16
 """Share of the surest family's log p-value, and of its evidence, that another one has at least where it may be named
 instead; and its weights where curves overlap."""
+_SHOWN: Final = 3.0
+"""Nats that a way of saying it more plainly shows by itself at least."""
 _FARTHEST: Final = 1e-20
 """p-value below which all are as sure: replicates give a few weights a longer tail than hundreds."""
 
@@ -95,10 +97,10 @@ def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
         few = [t for t in alike if len(t.variance) <= _FEW or _overlapping(t.family.pattern) is not None]
         best = max(few, key=evidence)
         told = max((t for t in few if _is_of_data(t.family.pattern)), key=evidence, default=best)
-        return told if evidence(told) >= _NEARLY * evidence(best) else best
+        return told if evidence(told) >= max(_NEARLY * evidence(best), _SHOWN) else best
     if pattern.kept and not _is_plain(pattern):
         plain = max((t for t in alike if _is_plain(t.family.pattern)), key=evidence, default=surest)
-        return plain if evidence(plain) >= _NEARLY * evidence(surest) else surest
+        return plain if evidence(plain) >= max(_NEARLY * evidence(surest), _SHOWN) else surest
     return surest
 
 

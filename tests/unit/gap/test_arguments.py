@@ -10,7 +10,9 @@ import pytest
 import dtprob
 from dtprob.errors import InputError
 from dtprob.gap.keys import key_for
+from dtprob.gap.model.masked import counted
 from dtprob.gap.settings import Settings
+from dtprob.models.arguments import doubled
 
 KEY = jax.random.key(0)
 QUICK = Settings(replicates=50, site_replicates=19, site_times=1)
@@ -84,3 +86,54 @@ def test_named_keys_are_those_of_no_split():
     children = jax.random.key_data(jax.random.split(KEY, 4000))
     named = [jax.random.key_data(key_for(KEY, f"step {i}")) for i in range(20)]
     assert len({tuple(map(int, k)) for k in [*children, *named]}) == 4020
+
+
+def test_chains_in_threads_have_the_same_precision():
+    """Threads have a precision of their own: NUTS, asked for in a notebook of single precision, ended the diagnosis."""
+    with jax.enable_x64(False):
+        given = data(np.float32)
+        with jax.enable_x64(True):
+            posterior = dtprob.fit(
+                line, doubled(given), engine="nuts", key=KEY, chains=2, draws=20, warmup=20
+            )
+    assert posterior.draws["slope"].dtype == np.float64
+
+
+def test_columns_keep_their_order_and_become_double():
+    given = {"z": np.float16(1.5), "a": jnp.ones(2, jnp.complex64), "n": np.arange(3), "word": "x"}
+    found = doubled(given)
+    assert list(found) == ["z", "a", "n", "word"]
+    assert [getattr(v, "dtype", None) for v in found.values()] == [np.float64, np.complex128, np.int64, None]
+
+
+def padded(ok, y=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 5.0))
+    with numpyro.plate("group", 8, dim=-2), numpyro.plate("slot", 12, dim=-1), numpyro.handlers.mask(mask=ok):
+        jitter = numpyro.sample("jitter", dist.Normal(0.0, 1.0))
+        mean = numpyro.deterministic("mean", level + jitter)
+        numpyro.sample("y", dist.Normal(mean, 0.5), obs=y)
+
+
+def test_padded_rows_of_groups_are_no_gap_and_whole_masks_stay():
+    rng = np.random.default_rng(2)
+    ok = np.arange(12) < rng.integers(6, 13, 8)[:, None]
+    given = {"ok": jnp.asarray(ok), "y": jnp.asarray(rng.normal(1.0, 1.25**0.5, (8, 12)))}
+    assert dtprob.diagnose(padded, given, key=KEY, settings=QUICK).verdict == "NO_GAP"
+    assert counted(padded, given) is not padded
+
+    def whole(y=None):
+        numpyro.sample(
+            "y", dist.Normal(numpyro.sample("free", dist.Normal(0.0, 1.0).mask(False)), 1.0), obs=y
+        )
+
+    assert counted(whole, {"y": jnp.ones(())}) is whole
+
+
+def test_obs_mask_is_refused_with_what_to_do():
+    def masked(y=None):
+        level = numpyro.sample("level", dist.Normal(0.0, 5.0))
+        with numpyro.plate("row", 8):
+            numpyro.sample("y", dist.Normal(level, 1.0), obs=y, obs_mask=jnp.arange(8) > 2)
+
+    with pytest.raises(InputError, match=r"observed site 'y': expected no obs_mask.*handlers\.mask"):
+        dtprob.diagnose(masked, {"y": jnp.ones(8)}, key=KEY, settings=QUICK)

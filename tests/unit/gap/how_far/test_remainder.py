@@ -259,7 +259,7 @@ def test_what_is_chance_is_not_modelled():
 
 
 @pytest.mark.parametrize(
-    ("gains", "kept"), [((3.0, 5.0), 1), ((3.0, -50.0), 0), ((-1.0, 2.0), 1), ((-1.0, -2.0), None)]
+    ("gains", "kept"), [((3.0, 5.0), 1), ((3.0, -50.0), 0), ((-1.0, 2.0), 1), ((-1.0, -2.0), 0)]
 )
 def test_what_predicts_no_better_is_left_out_of_the_model(gains, kept, monkeypatch):
     """Each further term costs what it adds to the evidence, and has to predict clusters that were left out."""
@@ -272,7 +272,8 @@ def test_what_predicts_no_better_is_left_out_of_the_model(gains, kept, monkeypat
         lambda wider, parts: SimpleNamespace(log_likelihood=np.array([gains[parts[0].full.name]])),
     )
     found = _held(None, fits, folds, SimpleNamespace(log_likelihood=np.zeros(1)))
-    assert (None if found is None else found[0].name) == kept
+    assert found[0].name == kept
+    assert found[2].log_likelihood[0] == gains[kept]
 
 
 class Refitted(NamedTuple):

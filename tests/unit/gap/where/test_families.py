@@ -465,3 +465,18 @@ def test_what_bends_at_a_value_is_told_as_a_bend():
     bend = tests["bend at a value of distance"]
     assert bend.p_value < min(1e-6, tests["beyond a value of distance"].p_value)
     assert float(bend.pattern.split()[2]) == pytest.approx(250.0, abs=40.0)
+
+
+@pytest.mark.parametrize(
+    "column", [np.minimum(np.arange(600.0), 20.0), np.maximum(np.arange(600.0) - 300.0, 0.0)]
+)
+def test_bends_at_the_ends_of_a_column_are_none(column):
+    """A meter at its end tells of no bend there, and a bend where a column begins is a line."""
+    found = [c for c in quantity("meter", ("row",), column).curves() if c.label.startswith("bend")]
+    assert all(c.extent[0] == len(c.places) > 0 for c in found)
+    assert not any(
+        place == f"bend at {end:.4g} of meter"
+        for c in found
+        for place in c.places
+        for end in (column.min(), column.max())
+    )
