@@ -172,7 +172,10 @@ def test_what_jax_cannot_trace_is_told_in_one_line():
         with numpyro.plate("place", len(distance)):
             numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
 
-    with pytest.raises(InputError, match=r"model branching: expected operations .* jnp.where"):
+    with pytest.raises(
+        InputError,
+        match=r"model branching \(test_declaration.py, line \d+\): expected operations .* jnp.where",
+    ):
         declare(branching, {"distance": jnp.ones(5), "y": jnp.ones(5)})
 
 
