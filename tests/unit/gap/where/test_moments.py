@@ -118,7 +118,7 @@ def recurring(seed):
         (echoed, "y", "dependence on those 3 before along time"),
         pytest.param(recurring, "y", "dependence on those 2 before along time", marks=pytest.mark.study),
         (skewed, "y", "skewness"),
-        (heavy, "z", "spread"),  # of single entries, and tails
+        (heavy, "z", "tails"),  # the spread of single entries follows them
         (remembered, "y", "dependence on the one before along time"),
         pytest.param(across, "z", "dependence from output to output", marks=pytest.mark.study),
         (shared, "y", "dependence on z"),
