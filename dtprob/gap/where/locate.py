@@ -40,6 +40,8 @@ from dtprob.gap.where.suspects import Suspect, plainest, suspects
 
 _ALL_SPREAD: Final = 0.999
 """Share of what a site moves that lies in spreads where it moves nothing else."""
+_FOLLOWS: Final = 10
+"""Readings for each weight of a family, below which it follows noise that is larger at some of them."""
 _MORE: Final = 400
 """Replicates of a second look at the sites, at least; a third one takes all that the settings allow."""
 _OPEN_AT_FIRST: Final = (1e-9, 0.5)
@@ -281,6 +283,8 @@ def _finding(
     shifts = projection.rows(shifted(problem, fitted.x, site, steps))
     gain = gains(drawn.rows[: 1 + CHANCE], shifts, problem.rows.is_spread)
     net, beyond = (max(float(gain[0] - e * gain[1:].mean()), 0.0) for e in (1.0, energy))
+    if _FOLLOWS * len(best.variance) > problem.observed.count:  # so many weights follow noise wherever it is
+        beyond = 0.0
     p_value = in_all.p_value(best)
     moved = np.sum(shifts[0] ** 2)
     spreads = bool(moved > 0 and np.sum(shifts[0][problem.rows.is_spread] ** 2) > _ALL_SPREAD * moved)
