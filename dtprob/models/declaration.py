@@ -191,6 +191,23 @@ def trace_model(
         raise _misfit(function, error, traced.trace) from error
 
 
+def look_at_trace(function: Model, data: Data, look: Callable[[str, dict[str, Any]], None]) -> None:
+    """Show every message of the model's trace, by its name, in one abstract run: nothing is computed.
+
+    Args:
+        function: a NumPyro model.
+        data: its arguments by name.
+        look: is called with each name and message; what they hold are tracers.
+    """
+    arrays, static = split_static(data)
+
+    def run(arrays: dict[str, Any], key: jax.Array) -> None:
+        for name, message in trace_model(function, eqx.combine(arrays, static), key).items():
+            look(name, message)
+
+    jax.eval_shape(run, arrays, jax.random.key(0))
+
+
 def _misfit(function: Model, error: Exception, trace: Mapping[str, Mapping[str, Any]]) -> InputError:
     """Of shapes that do not fit, with the place in the user's code and the plates that the model had come to."""
     plates = [

@@ -6,13 +6,11 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-import equinox as eqx
-import jax
 from numpyro.distributions import biject_to, constraints
 
 from dtprob.errors import InputError
-from dtprob.models.arguments import Data, Model, model_name, split_static
-from dtprob.models.declaration import Declaration, base_constraint, trace_model
+from dtprob.models.arguments import Data, Model, model_name
+from dtprob.models.declaration import Declaration, base_constraint, look_at_trace
 
 
 @contextmanager
@@ -41,14 +39,12 @@ def check_supported(model: Model, data: Data) -> None:
     Raises:
         InputError: there is something that has no density with a gradient.
     """
-    arrays, static = split_static(data)
 
-    def run(arrays: Any, key: jax.Array) -> None:
-        for name, message in trace_model(model, eqx.combine(arrays, static), key).items():
-            refuse_unsupported(model, name, message)
-            _refuse_scaled(model, name, message)
+    def look(name: str, message: Mapping[str, Any]) -> None:
+        refuse_unsupported(model, name, message)
+        _refuse_scaled(model, name, message)
 
-    jax.eval_shape(run, arrays, jax.random.key(0))
+    look_at_trace(model, data, look)
 
 
 def _refuse_scaled(model: Model, name: str, message: Mapping[str, Any]) -> None:

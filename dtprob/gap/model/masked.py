@@ -7,14 +7,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import equinox as eqx
-import jax
 import jax.numpy as jnp
 from numpyro.primitives import Messenger
 
 from dtprob.effects.changing import is_scan
-from dtprob.models.arguments import Data, Model, split_static, within
-from dtprob.models.declaration import trace_model
+from dtprob.models.arguments import Data, Model, within
+from dtprob.models.declaration import look_at_trace
 from dtprob.wrapping import unwrapped, wrapped
 
 
@@ -38,15 +36,9 @@ def counted(model: Model, data: Data) -> Model:
         model: any model.
         data: its arguments by name.
     """
-    arrays, static = split_static(data)
-    masked: list[str] = []
-
-    def run(arrays: Any, key: jax.Array) -> None:
-        trace = trace_model(model, eqx.combine(arrays, static), key)
-        masked.extend(name for name, message in trace.items() if _is_masked(message))
-
-    jax.eval_shape(run, arrays, jax.random.key(0))
-    return within(model, _Counted) if masked else model
+    masked: list[bool] = []
+    look_at_trace(model, data, lambda _, message: masked.append(_is_masked(message)))
+    return within(model, _Counted) if any(masked) else model
 
 
 def _is_masked(message: dict[str, Any]) -> bool:

@@ -61,9 +61,8 @@ def suspects(site: Site, tests: Sequence[FamilyTest]) -> list[Suspect]:
     found = [one(test) for test in moved if _overlapping(test.family.pattern) is None]
     found += [one(narrow, band) for test in moved for narrow, band in _narrowed(test)]
     ordered = sorted((suspect for suspect in found if suspect is not None), key=lambda s: -s.steady)
-    each = [
-        i for i, s in enumerate(ordered) if s.family.pattern.curves is None
-    ]  # their scatter is what they say
+    # of entries by themselves the scatter is what they say
+    each = [i for i, s in enumerate(ordered) if s.family.pattern.curves is None]
     most = max(each, key=lambda i: ordered[i].evidence, default=0)
     kept = ordered[:_MOST_SUSPECTS]
     return kept if most < _MOST_SUSPECTS else [*kept[:-1], ordered[most]]
@@ -87,8 +86,8 @@ def plainest(surest: FamilyTest, tests: Sequence[FamilyTest]) -> FamilyTest:
 
     Curves that overlap are tested together: what varies along another column shows in many of them, so that the most
     evident of them and of the families of few weights is named, over a column of the data sooner than over what the model
-    computes. What varies over positions (a ripple, a cycle, each
-    position by itself) is told by the column that it follows, where there is one.
+    computes. What varies over positions (a ripple, a cycle, each position by itself) is told by the column that it follows,
+    where there is one.
     """
     evidence = functools.partial(_evidence, scatter=_scatter(tests, surest.family.kind))
     pattern, most = surest.family.pattern, _NEARLY * np.log(max(surest.p_value, _FARTHEST))
