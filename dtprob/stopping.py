@@ -59,7 +59,6 @@ class Stopping:
         self.again()
 
     def _remind(self, *_: object) -> None:
-        if not isinstance(
-            sys.exception(), (KeyboardInterrupt, Terminated)
-        ):  # else what it raised is cleaning up
+        has_arrived = isinstance(sys.exception(), (KeyboardInterrupt, Terminated))  # and cleans up
+        if not has_arrived:
             self.again()
