@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from dtprob import stopping
+from dtprob import __version__, stopping
 from dtprob.cli import COMMANDS, main, parser
 from dtprob.errors import Terminated
 from dtprob.inference import SVI, Posterior
@@ -529,3 +529,9 @@ def test_what_cleans_up_after_a_signal_is_left_alone(number, monkeypatch):
         signal.setitimer(signal.ITIMER_REAL, 0.0)
         signal.signal(signal.SIGALRM, former)
         signal.signal(signal.SIGINT, before)
+
+
+def test_the_command_line_is_there_as_a_module():
+    command = [sys.executable, "-m", "dtprob", "--version"]
+    found = subprocess.run(command, capture_output=True, text=True, timeout=300, check=True)
+    assert found.stdout == f"dtprob {__version__}\n"

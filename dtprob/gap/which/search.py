@@ -22,7 +22,7 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.view import View, view
 from dtprob.gap.which.classes import IDLE
 from dtprob.gap.which.stand_in import stands_in
-from dtprob.gap.which.starts import beside, promising, refitted_with, refitted_without
+from dtprob.gap.which.starts import beside, exchanged, promising, refitted_with, refitted_without
 from dtprob.gap.which.trials import Say, Start, Trials, best, credit, remembered, tried
 
 _RETURNS: Final = 3
@@ -115,11 +115,39 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
                 both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=reached
             )
             ways.append([*steps[:-1], *others])
+    key = key_for(key, "exchange")
+    others = _exchanged(problem, ways, key, settings, say, base=base, banned=field)
+    if others:
+        ways.append([*steps[:-1], *others])
     ways = _ranked(problem, ways, base)
     if stands_in(bare, ways[0][-1].view, base, field, say):
         ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
     ends = [way[-1].view for way in ways]
     return Search(ways[0], tuple(Start(e.problem, e.fitted) for e in ends[1:] if e.fitted.effects))
+
+
+def _exchanged(
+    problem: Problem,
+    ways: Sequence[Sequence[Step]],
+    key: jax.Array,
+    settings: Settings,
+    say: Say,
+    *,
+    base: fitting.Fit,
+    banned: str | None,
+) -> list[Step]:
+    """The steps from the best pair that takes the place of two effects that were found; none if it is no better."""
+    reached = _reached(problem, ways, base)
+    views, ends = [step.view for way in ways for step in way], [way[-1].view for way in ways]
+    fits = []
+    for seen, pair in exchanged(views, ends, reached, base, settings):
+        say(f"refitting with {pair[0]} and {pair[1]} beside {', '.join(seen.fitted.effects)}")
+        fits.append(refitted_with(seen, pair, settings))
+    better = [one for one in fits if credit(problem, one.fitted, base) > reached + BETTER]
+    start = max(better, key=lambda one: credit(problem, one.fitted, base), default=None)
+    if start is None or bound(start.problem, start.fitted):
+        return []
+    return _forward(start.problem, start.fitted, key, settings, say, base=base, banned=banned, goal=reached)
 
 
 def _ranked(problem: Problem, ways: Sequence[list[Step]], base: fitting.Fit) -> list[list[Step]]:

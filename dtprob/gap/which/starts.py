@@ -22,6 +22,8 @@ _UNDERSTATED: Final = 0.15
 """Share of a gain that first-order scores may miss."""
 _BESIDE: Final = 4
 """Fits beside which a random field is fitted once more, at most."""
+_EXCHANGED: Final = 3
+"""Pairs that are fitted in place of what was found, at most."""
 
 
 def promising(
@@ -52,6 +54,38 @@ def promising(
     enough = max(alone + np.log(len(first.problem.effects)) + _NEARLY, (1 - _UNDERSTATED) * reached - _NEARLY)
     new = not any(set(best.names) <= own for own in found)
     return best.names if new and best.log_bayes_factor > enough else None
+
+
+def exchanged(
+    views: Sequence[View], ends: Sequence[View], reached: float, base: fitting.Fit, settings: Settings
+) -> list[tuple[View, tuple[str, str]]]:
+    """Pairs beside a part of what was found that promise as much as all of it, the most promising first.
+
+    Steps one after another may take two effects that are nearly right together, such as the gains of all elements but the
+    first and of the first, where two plainer ones are right: a gain and a phase. Neither of these is best alone.
+
+    Args:
+        views: fits, some beside a part of what was found.
+        ends: where each way ended.
+        reached: the most credit that a way ended with.
+        base: the fit of the model alone.
+        settings: largest set.
+    """
+    known = [set(end.fitted.effects) for end in ends]
+    promised: dict[frozenset[str], tuple[float, View, tuple[str, str]]] = {}
+    for seen in views:
+        own = set(seen.fitted.effects)
+        if not own or len(own) + 2 > settings.max_effects or not any(own < found for found in known):
+            continue
+        least = reached - _NEARLY - _UNDERSTATED * (reached - credit(seen.problem, seen.fitted, base))
+        for pair in seen.screening.scores.pairs():
+            effects = (*seen.fitted.effects, *pair.names)
+            evidence = seen.fitted.log_evidence + pair.log_bayes_factor
+            promise = credit(seen.problem, replace(seen.fitted, effects=effects, log_evidence=evidence), base)
+            if promise > least and not any(set(effects) <= found for found in known):
+                promised[frozenset(effects)] = promise, seen, pair.names
+    best = sorted(promised.values(), key=lambda one: -one[0])
+    return [(seen, names) for _, seen, names in best[:_EXCHANGED]]
 
 
 def beside(
