@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from typing import Any, Final
 
 import jax.numpy as jnp
@@ -176,35 +176,69 @@ def iq_imbalance(sites: Sites, data: Data) -> list[Effect]:
     measured = band(data)
     if measured is None or not has_phase(sites) or not _has_mirror(data):
         return []
-    chains = [(None, None), *each_antenna(n_antenna(sites, "rx"), "rx")]
     effects = []
-    for index, name in chains:
-
-        def image(
-            value: Any, p: Mapping[str, Any], context: Mapping[str, Any], index: int | None = index
-        ) -> Any:
-            mirror, exists = _mirror(context["subcarrier_frequency"])
-            own = jnp.ones(value.shape[2]) if index is None else jnp.arange(value.shape[2]) == index
-            own = on_axis(jnp.asarray(own, float), "rx_antenna", CHANNEL_AXES)
-            half, amplitude = p["phase"] / 2, p["amplitude"]
-            direct = jnp.cos(half) + 1j * amplitude * jnp.sin(half) - 1.0
-            crossed = amplitude * jnp.cos(half) - 1j * jnp.sin(half)
-            reflected = jnp.where(exists, jnp.conj(value[..., mirror]), 0.0)
-            return value + own * (direct * value + crossed * reflected)
-
+    for index, name in [(None, None), *each_antenna(n_antenna(sites, "rx"), "rx")]:
         effects.append(
-            Effect(
-                "iq_imbalance",
-                {"noiseless_channel": image},
-                (normal("amplitude", 0.05), normal("phase", 0.05, "rad")),
-                instance=name,
-                physics="Gain and phase mismatch of the receiver's branches; subcarrier k gets the conjugate"
+            _mixing(
+                name,
+                _both_branches,
+                "Gain and phase mismatch of the receiver's branches; subcarrier k gets the conjugate"
                 " of -k. Holds for pilots that are real and equal on mirror subcarriers, as in sounding.",
-                source="y = mu x + nu x*: Tarighat et al., IEEE Trans. Signal Process. 53 (2005).",
-                requires=("subcarrier_frequency",),
+                "y = mu x + nu x*: Tarighat et al., IEEE Trans. Signal Process. 53 (2005).",
+                index,
             )
         )
+    effects.append(
+        _mixing(
+            "one_branch",
+            _one_branch,
+            "Gain and phase of one branch of the receiver's mixer, beside the other, by which levels and phases"
+            " count: all that is received turns and grows a little, too.",
+            "mu = (1 + g exp(-j phi)) / 2, nu = (1 - g exp(j phi)) / 2: Valkama et al., IEEE Trans. Signal"
+            " Process. 49 (2001).",
+        )
+    )
     return effects
+
+
+def _mixing(
+    instance: str | None,
+    shares: Callable[[Array, Array], tuple[Array, Array]],
+    physics: str,
+    source: str,
+    index: int | None = None,
+) -> Effect:
+    """What a mismatch of the branches does to one receiving antenna, or all; shares tell mu and nu by gain and phase."""
+
+    def mix(value: Any, p: Mapping[str, Any], context: Mapping[str, Any]) -> Any:
+        mirror, exists = _mirror(context["subcarrier_frequency"])
+        own = jnp.ones(value.shape[2]) if index is None else jnp.arange(value.shape[2]) == index
+        own = on_axis(jnp.asarray(own, float), "rx_antenna", CHANNEL_AXES)
+        direct, crossed = shares(p["amplitude"], p["phase"])
+        reflected = jnp.where(exists, jnp.conj(value[..., mirror]), 0.0)
+        return value + own * ((direct - 1.0) * value + crossed * reflected)
+
+    return Effect(
+        "iq_imbalance",
+        {"noiseless_channel": mix},
+        (normal("amplitude", 0.05), normal("phase", 0.05, "rad")),
+        instance=instance,
+        physics=physics,
+        source=source,
+        requires=("subcarrier_frequency",),
+    )
+
+
+def _both_branches(amplitude: Array, phase: Array) -> tuple[Array, Array]:
+    """Branches of gains 1 + a and 1 - a, turned by half the phase each against the other."""
+    half = phase / 2
+    return jnp.cos(half) + 1j * amplitude * jnp.sin(half), amplitude * jnp.cos(half) - 1j * jnp.sin(half)
+
+
+def _one_branch(amplitude: Array, phase: Array) -> tuple[Array, Array]:
+    """One branch as it should be, the other of gain 1 + a and turned by the phase."""
+    other = 1.0 + amplitude
+    return (1.0 + other * phasor(-phase)) / 2, (1.0 - other * phasor(phase)) / 2
 
 
 def _mirror(frequency: Float[Array, " n"]) -> tuple[Int[Array, " n"], Bool[Array, " n"]]:

@@ -7,6 +7,7 @@ from typing import Any, Final
 
 import jax.numpy as jnp
 import numpy as np
+import numpyro.distributions as dist
 
 from dtprob.effects.common import (
     COMPLEX,
@@ -23,12 +24,16 @@ from dtprob.effects.common import (
     reference_power,
     square,
 )
-from dtprob.effects.effect import Effect
+from dtprob.effects.effect import Effect, Parameter
 from dtprob.effects.meaning import CHANNEL_AXES
 
 _SALEH: Final = (
     "A. Saleh, IEEE Trans. Commun. 29 (1981); to first order the cubic term of a memoryless polynomial."
 )
+_KNEE: Final = 0.4
+"""Of the log of the power's exponent: tubes compress from afar (1), transistors near saturation (2 and more)."""
+_FAINT: Final = 1e-12
+"""Power, in units of the mean, below which no entry is taken: its logarithm has a derivative."""
 
 
 def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
@@ -38,7 +43,8 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
         return []
 
     def compress(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
-        return value / (1.0 + p["compression"] * square(value) / power)
+        level = jnp.maximum(square(value) / power, _FAINT)
+        return value / (1.0 + p["compression"] * level ** jnp.exp(p["log_knee"]))
 
     def compress_all(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
         level = jnp.mean(square(value), axis=-1, keepdims=True) / power
@@ -48,14 +54,16 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
         level = square(value) / power
         return value * phasor(p["phase"] * level / (1.0 + level))
 
-    compression = (half_normal("compression", 0.1),)
+    compression = half_normal("compression", 0.1)
+    knee = Parameter("log_knee", dist.Normal(0.0, _KNEE), is_place=True)
     effects = [
         Effect(
             "amplifier_nonlinearity",
             {"noiseless_channel": compress},
-            compression,
-            physics="Gain falls with the power of the entry: one tone at a time. Unit: the mean power.",
-            source="h / (1 + c |h|^2 / P): " + _SALEH,
+            (compression, knee),
+            physics="Gain falls with the power of the entry: one tone at a time, the sharper the larger the knee."
+            " Unit: the mean power.",
+            source="h / (1 + c (|h|^2 / P)^k): for k = 1 " + _SALEH,
         ),
         Effect(
             "amplifier_nonlinearity",
@@ -70,7 +78,7 @@ def amplifier_nonlinearity(sites: Sites, data: Data) -> list[Effect]:
         wideband = Effect(
             "amplifier_nonlinearity",
             {"noiseless_channel": compress_all},
-            compression,
+            (compression,),
             instance="wideband",
             physics="Gain falls with the power over the whole band: all subcarriers at a time.",
             source="h / (1 + c mean_k |h|^2 / P): " + _SALEH,

@@ -360,11 +360,24 @@ def test_iq_imbalance_mixes_mirror_subcarriers(apply):
     assert np.allclose(found, mu * before + nu * np.conj(before[..., ::-1]))
 
 
+def test_one_branch_leaves_the_other_as_it_is(apply):
+    """What is real in time passes, with a share that leaks into the other branch; what is imaginary grows by 1 + g."""
+    before, g, phi = apply()["noiseless_channel"], 0.1, 0.06
+    mirrored = np.conj(before[..., ::-1])
+    real, imaginary = (before + mirrored) / 2, (before - mirrored) / 2
+    found = apply("iq_imbalance[one_branch]", amplitude=g, phase=phi)["noiseless_channel"]
+    expected = real * (1 - 1j * (1 + g) * np.sin(phi)) + imaginary * (1 + g) * np.cos(phi)
+    assert np.allclose(found, expected)
+
+
 def test_compression_saturates(world, apply):
     before = apply()["noiseless_channel"]
     power = np.mean(np.abs(np.asarray(world.data["channel"])) ** 2)
-    found = apply("amplifier_nonlinearity", compression=0.2)["noiseless_channel"]
-    assert np.allclose(found, before / (1 + 0.2 * np.abs(before) ** 2 / power))
+    level = np.abs(before) ** 2 / power
+    found = apply("amplifier_nonlinearity", compression=0.2, log_knee=0.0)["noiseless_channel"]
+    assert np.allclose(found, before / (1 + 0.2 * level))
+    sharper = apply("amplifier_nonlinearity", compression=0.2, log_knee=np.log(2))["noiseless_channel"]
+    assert np.allclose(sharper, before / (1 + 0.2 * level**2))
 
 
 def test_noise_by_hand(world, apply):

@@ -55,7 +55,7 @@ def test_single_antennas_have_no_array(build_world):
         *("near_field", "angular_spread"),
     }
     assert "antenna_pattern" in offered
-    assert [e.instance for e in catalogue(world.sites, world.data, "iq_imbalance")] == [None]
+    assert [e.instance for e in catalogue(world.sites, world.data, "iq_imbalance")] == [None, "one_branch"]
 
 
 def test_two_antennas_are_calibrated_once(build_world, world):
