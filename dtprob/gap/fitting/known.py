@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,6 +25,8 @@ _NEAR: Final = 0.5
 """Standard deviations from the prior's centre up to which a slope tells nothing of the spread."""
 _FARTHEST: Final = 3.0
 """Standard deviations from which draws of the prior tell no longer how far out a point is."""
+_FLAT: Final = 1.25
+"""Times the prior's spread that its curvature alone puts it at, where it falls off as an exponential does, at most."""
 _ALONE: Final = 1e-6
 """Share of its own curvature beyond which a coordinate's prior depends on another one."""
 
@@ -85,6 +88,7 @@ def _skewed(
     known = {name for names in problem.known for name in names}
     base = [b for b in active.blocks if b.owner is None and b.name not in known and not _is_heavy(problem, b)]
     at = np.unique(np.concatenate([b.index.reshape(-1) for b in base])) if base else np.zeros(0, int)
+    alone = alone | _tied_within(problem, active, base, x, slope=slope, hessian=hessian)
     at = at[alone[at] & (np.abs(slope[at]) * problem.prior_spread.deviation[at] > _LEVEL)]
     at = at[np.abs(curvature[at]) > _FAINT * told[at]]
     middle, spread = problem.prior_spread.middle[at], problem.prior_spread.deviation[at]
@@ -92,12 +96,41 @@ def _skewed(
         here = 1 / np.sqrt(curvature[at])
         centre = x[at] + slope[at] * here**2
         is_normal = np.maximum(np.abs(centre - middle), np.abs(here - spread)) < _ALIKE * spread
-    at, here = at[~is_normal], here[~is_normal]
+    at, here, spread = at[~is_normal], here[~is_normal], spread[~is_normal]
     drawn = np.abs(problem.prior_spread.score(x, at))
     score = np.maximum(drawn, _NEAR)
     is_near = np.abs(slope[at]) * here < (1 + _ALIKE) * score
     wrong = ~is_near & (drawn < _FARTHEST)
     found[at[wrong]] = (slope[at] / score)[wrong] ** 2
+    found[at[~is_near & (here > _FLAT * spread)]] = 0.0
+    return found
+
+
+def _tied_within(
+    problem: Problem,
+    active: Active,
+    base: Sequence[Block],
+    x: np.ndarray,
+    *,
+    slope: np.ndarray,
+    hessian: np.ndarray,
+) -> Bool[np.ndarray, " dimension"]:
+    """Shared coordinates whose prior depends on others of their own site alone, and is not normal together with them.
+
+    So are the log ratios of a table of chances: that of an outcome which was never seen lies in an exponential tail.
+    """
+    found, moved = np.zeros(len(x), bool), np.asarray(active.global_index)
+    for block in base:
+        is_own = np.isin(moved, block.index)
+        if block.local or is_own.sum() < 2:
+            continue
+        own, rows = moved[is_own], hessian[: len(moved)][is_own]
+        precision, beside = rows[:, own], np.delete(rows, own, axis=1)
+        if np.abs(beside).max(initial=0.0) > _ALONE * np.abs(precision).max():
+            continue
+        centre = x[own] + np.linalg.solve(positive(precision), slope[own])
+        middle, spread = problem.prior_spread.middle[own], problem.prior_spread.deviation[own]
+        found[own] = (np.abs(centre - middle) > _ALIKE * spread).any()
     return found
 
 

@@ -17,6 +17,7 @@ from dtprob.gap.fitting.projection import project
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
 from dtprob.inference import Laplace
+from dtprob.models.dirichlet import LogDirichlet
 from tests import small_world
 
 ROWS = 80
@@ -119,3 +120,35 @@ def test_screens_of_a_small_scene_have_names_of_their_own(scale):
     )
     offered = catalogue(world.sites, {**world.data, "paths": shrunk}, "missing_object")
     assert len({effect.name for effect in offered}) == len(offered) > 5
+
+
+CHANCES = np.array(
+    [[0.9, 0.1, 0.0, 0.0], [0.6, 0.33, 0.07, 0.0], [0.86, 0.07, 0.07, 0.0], [0.97, 0.0, 0.03, 0.0]]
+)
+
+
+def by_log_ratios():
+    return numpyro.sample("table", LogDirichlet(0.5, np.ones((4, 4), bool)))
+
+
+def by_sticks():
+    return jnp.log(numpyro.sample("table", dist.Dirichlet(0.5 * jnp.ones((4, 4))).to_event(1)))
+
+
+@pytest.mark.parametrize("table", [by_log_ratios, by_sticks])
+@pytest.mark.parametrize("seed", [0, 3])
+def test_outcomes_that_never_come_are_no_gap_of_a_table_of_chances(table, seed):
+    """Where nothing of an outcome was seen its log ratio lies in an exponential tail, of hardly a curvature."""
+
+    def outcomes(group, y=None):
+        logits = numpyro.deterministic("logits", table()[group])
+        with numpyro.plate("slot", len(group)):
+            numpyro.sample("y", dist.Categorical(logits=logits), obs=y)
+
+    rng = np.random.default_rng(seed)
+    group = rng.choice(4, size=800, p=[0.3, 0.4, 0.2, 0.1])
+    y = np.array([rng.choice(4, p=CHANCES[i]) for i in group])
+    assert told(outcomes, group=group, y=y).verdict == "NO_GAP"
+    late = np.arange(len(y)) > 400
+    y = np.where(late & (rng.random(len(y)) < 0.3), 1, y)
+    assert told(outcomes, group=group, y=y).verdict == "UNLISTED"
