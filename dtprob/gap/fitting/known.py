@@ -25,8 +25,6 @@ _NEAR: Final = 0.5
 """Standard deviations from the prior's centre up to which a slope tells nothing of the spread."""
 _FARTHEST: Final = 3.0
 """Standard deviations from which draws of the prior tell no longer how far out a point is."""
-_FLAT: Final = 1.25
-"""Times the prior's spread that its curvature alone puts it at, where it falls off as an exponential does, at most."""
 _ALONE: Final = 1e-6
 """Share of its own curvature beyond which a coordinate's prior depends on another one."""
 
@@ -82,7 +80,7 @@ def _skewed(
 
     The logarithm of a half-normal spread far below its scale has a slope and hardly a curvature: these put it many standard
     deviations from a centre that is nowhere, where one in seven draws is smaller. With the slope held, the precision is
-    the one that puts x where it lies among draws.
+    the one that puts x where it lies among draws; nothing is known where the prior is less curved than most of it.
     """
     found, curvature, alone = np.full(len(x), np.nan), *_own_curvature(active, hessian, len(x))
     known = {name for names in problem.known for name in names}
@@ -102,7 +100,7 @@ def _skewed(
     is_near = np.abs(slope[at]) * here < (1 + _ALIKE) * score
     wrong = ~is_near & (drawn < _FARTHEST)
     found[at[wrong]] = (slope[at] / score)[wrong] ** 2
-    found[at[~is_near & (here > _FLAT * spread)]] = 0.0
+    found[at[~is_near & (here > spread)]] = 0.0  # falls off as an exponential does
     return found
 
 
