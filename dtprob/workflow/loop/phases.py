@@ -101,7 +101,12 @@ def hand_over(twin: Twin, state: State) -> State:
     """Give the devices the trained policy, if it is foreseen to deliver more than the one they have."""
     old, new = (_foreseen(twin, state, policy) for policy in (state.policy, state.trained))
     better = new.mean > old.mean
-    after = state._replace(policy=state.trained if better else state.policy, handed=state.slots, changed=-1)
+    after = state._replace(
+        policy=state.trained if better else state.policy,
+        handed=state.slots,
+        watched=state.slots if state.watched < 0 else state.watched,
+        changed=-1,
+    )
     low, high = new.interval()
     entry = {
         "why": f"foreseen over {_FORESEEN} slots: {new.mean:.3f} packets per slot, with the old one {old.mean:.3f}",
@@ -117,13 +122,15 @@ def monitor(twin: Twin, state: State) -> State:
     loop = twin.case.loop
     after = _played(twin, state, state.policy, min(_WINDOWS_AT_ONCE * loop.window, loop.slots - state.slots))
     over = after.slots >= loop.slots or after.slots == state.slots
-    seen = watch(twin.case, after) if after.slots - after.handed >= loop.window else None
+    seen = watch(twin.case, after) if after.slots - after.watched >= loop.window else None
     calls = seen is not None and seen.alarm is not None
+    if seen is not None:
+        after = after._replace(detector=seen.detector)
     if not over and not (calls and loop.relearn):
         return after._replace(step=state.step + 1)
     entry: Entry = {"why": "no slots are left", "alarm": calls, **_throughput(after, after.handed)}
     if seen is not None and seen.alarm is not None:
-        entry |= _alarm(seen, state.handed + (seen.alarm + 1) * loop.window)
+        entry |= _alarm(seen, state.watched + (seen.alarm + 1) * loop.window)
         after = after._replace(changed=seen.changed)
     phase: Phase = "diagnose" if calls and loop.relearn else "done"
     return _next(twin, state._replace(rows=_until(state, state.handed)), after, phase, entry)
@@ -142,7 +149,9 @@ def diagnose(twin: Twin, state: State) -> State:
             entry |= diagnosed(case, after, _key(case, state), twin.say)
     prior, gone = forget(case, after, blame)
     entry["forgotten"] = list(gone)
-    after = after._replace(prior=prior, since=state.changed, round=state.round + 1)
+    after = after._replace(
+        prior=prior, since=state.changed, watched=-1, detector=np.zeros(0), round=state.round + 1
+    )
     return _next(twin, state, after, "collect" if after.slots < loop.slots else "done", entry)
 
 

@@ -78,7 +78,7 @@ def watched(case, seed, handed, slots):
     """A state in which time slots are watched, after as many slots that were learned from."""
     own = dataclasses.replace(case, seed=dataclasses.replace(case.seed, value=seed))
     rows = connect(own).play(TURNS, slots, np.random.default_rng(seed))
-    return own, begin(own)._replace(rows=rows, handed=handed, changed=-1)
+    return own, begin(own)._replace(rows=rows, handed=handed, watched=handed)
 
 
 def test_a_change_is_seen_placed_and_its_factor_named(case):
@@ -89,6 +89,16 @@ def test_a_change_is_seen_placed_and_its_factor_named(case):
         assert CHANGE <= 200 + (seen.alarm + 1) * 10 <= CHANGE + 80
         assert abs(seen.changed - CHANGE) <= 20
         assert max(seen.blame, key=seen.blame.get) == "arrivals[0]"
+
+
+def test_windows_that_were_judged_need_not_be_judged_again(case):
+    own, state = watched(case, 0, 200, 600)
+    whole, part = watch(own, state), state._replace(rows={n: c[:430] for n, c in state.rows.items()})
+    before = watch(own, part).detector
+    assert len(before) == 23
+    again = watch(own, state._replace(detector=before))
+    np.testing.assert_allclose(again.detector, whole.detector, rtol=1e-9)
+    assert (again.alarm, again.changed) == (whole.alarm, whole.changed)
 
 
 def test_false_alarms_are_as_rare_as_said(case):
