@@ -40,7 +40,7 @@ def records(
         TypeError: a window or capacity that is no whole number.
     """
     window, capacity = operator.index(window), operator.index(capacity)
-    known = Clusters(tuple(tuple(cluster) for cluster in clusters))
+    known = Clusters(tuple(clusters))
     devices = log.buffer.shape[1]
     if known.devices != devices:
         remedy = "Put every device of the log into one cluster"

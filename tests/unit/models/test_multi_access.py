@@ -160,6 +160,7 @@ def test_who_is_delivered_is_the_conditional_bernoulli_law():
     [
         (((0, 1), (1, 2)), "clusters: expected each device once"),
         (((0, 2),), "clusters: expected each device once"),
+        ((0, 1), "clusters: expected lists of devices' numbers, got \\[0, 1\\]"),
         (((0.5, 1),), "clusters: expected lists of devices' numbers"),
         (((False, True),), "clusters: expected lists of devices' numbers"),
         ((tuple(range(13)),), "clusters: expected at most 12 devices each, got 13"),
@@ -168,6 +169,19 @@ def test_who_is_delivered_is_the_conditional_bernoulli_law():
 def test_clusters_that_are_no_partition_are_refused(members, message):
     with pytest.raises(InputError, match=message):
         Clusters(members)
+
+
+def test_what_is_no_capacity_or_concentration_is_refused(log):
+    with pytest.raises(InputError, match="clusters: expected lists of devices' numbers"):
+        kernel((0, 1))
+    with pytest.raises(TypeError, match="integer"):
+        kernel(((0,), (1,)), 1.5)
+    with pytest.raises(InputError, match="clusters: expected lists of devices' numbers"):
+        records(log, clusters=[0, 1, 2, 3])
+    with pytest.raises(
+        InputError, match="concentration of a Dirichlet law: expected a finite number above 0"
+    ):
+        declare(multi_access, {**records(log, clusters=CLUSTERS), "concentration": 0.0})
 
 
 def test_a_log_that_does_not_fit_is_refused(log):
