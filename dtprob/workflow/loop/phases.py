@@ -18,6 +18,7 @@ from dtprob.control import (
     tabulate,
     train,
 )
+from dtprob.control.learner import check_trained
 from dtprob.workflow.loop.diagnosis import diagnosed
 from dtprob.workflow.loop.foresight import FEW, HORIZON, foresee, shortfall
 from dtprob.workflow.loop.knowledge import Watched, forget, known, summary, watch
@@ -85,7 +86,9 @@ def control(twin: Twin, state: State) -> State:
     environment = Environment(kernel, pool, _HORIZON, _REDRAW)
     learner = COMA(caution=loop.caution or 0.0, capacity=kernel.capacity)
     start = FramePolicy(second, kernel.devices, capacity=kernel.capacity)
-    policy = tabulate(_train(third, learner, start, environment, _budget(loop.training, 20)).policy)
+    trained = _train(third, learner, start, environment, _budget(loop.training, 20))
+    check_trained(trained)
+    policy = tabulate(trained.policy)
     after = state._replace(trained=np.asarray(policy.probability, float))
     entry = {"why": f"{_POOL} networks that may be, {loop.training} virtual slots"}
     return _next(twin, state, after, "hand_over", entry)
