@@ -21,13 +21,12 @@ import numpy as np
 from record import record
 
 from dtprob.case import SeedSection
-from dtprob.control import TablePolicy
+from dtprob.control import Stateless, TablePolicy
 from dtprob.physical.multi_access import Network, average, chain
 from dtprob.twin.predict import predict
 from dtprob.twin.rollout import throughput
 from dtprob.workflow.loop import State, Twin, TwinCase, advance, begin, connect, finished, load_twin_case
 from dtprob.workflow.loop.knowledge import known
-from dtprob.workflow.loop.phases import Acting
 
 CASE = Path(__file__).parents[1] / "examples" / "network" / "twin.toml"
 CHANGE = 1500
@@ -41,10 +40,11 @@ def main() -> None:
     parser.add_argument("--write", action="store_true")
     options = parser.parse_args()
     rows = [row for seed in range(options.seeds) for row in pairs(seed)]
-    figures = {"rows": rows, "means": means(rows)}
-    for name, value in figures["means"].items():
+    found = means(rows)
+    for name, value in found.items():
         print(name, value)
     if options.write:
+        figures = {"rows": rows, "means": found}
         record("relearning", "twins that learn again against twins learned once", ["jax", "numpy"], figures)
 
 
@@ -60,7 +60,7 @@ def pairs(seed: int) -> list[dict[str, float]]:
             last = run(own, first, finished)
             row |= {f"{key}_{name}": value for key, value in judged(own, last, device).items()}
             if relearn:
-                row["alarms"] = last.round - 1
+                row["alarms"] = sum(bool(entry.get("alarm")) for entry in last.entries)
         print({key: round(value, 4) for key, value in row.items()}, flush=True)
         rows.append(row)
     return rows
@@ -91,7 +91,7 @@ def judged(case: TwinCase, state: State, device: int) -> dict[str, float]:
         jax.random.key(case.seed.value),
         case.kernel,
         known(case, state, state.handed),
-        policy=Acting(TablePolicy(jnp.asarray(state.policy, jnp.result_type(float)))),
+        policy=Stateless(TablePolicy(jnp.asarray(state.policy, jnp.result_type(float)))),
         metric=throughput,
         horizon=200,
         draws=100,

@@ -24,6 +24,8 @@ def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code:
     with session() as say:
         job = Run(out, resume, not no_code, say)
         prepared = prepare_case(chosen(case, engine, seed), job, "fit", ("summary.json",))
+        if prepared.case.data.reference is not None:
+            say(f"fitting {prepared.case.data.file.name} alone: only a diagnosis learns from the reference")
         posterior = infer(prepared, prepared.data, out / "posterior.nc", job)
         if "reason" in posterior.provenance:
             say(f"{posterior.provenance['chosen']} was chosen: {posterior.provenance['reason']}")

@@ -13,6 +13,7 @@ from dtprob.control.critic import CentralCritic
 from dtprob.control.policy import Memory, choice_entropy, log_chance, unroll_each
 from dtprob.control.returns import counterfactual_advantage, device_returns
 from dtprob.control.rollout import Trajectory
+from dtprob.errors import InputError
 
 
 class Kept(NamedTuple):
@@ -56,6 +57,17 @@ class COMA:
     frame: int = 4
     capacity: int = 1
     caution: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse a caution that weighs nothing.
+
+        Raises:
+            InputError: one that is no number, infinite or below 0.
+        """
+        if not 0 <= self.caution < float("inf"):
+            raise InputError(
+                "caution", "a finite number, 0 or more", f"{self.caution:g}", "Correct the value"
+            )
 
     def start(self, key: PRNGKeyArray, policy: Any) -> Kept:
         """See `Learner`."""

@@ -6,6 +6,7 @@ what it tells in all. Given the state, a slot's outcome is a joint arrival of ea
 deliveries; the devices' known parts tell nothing.
 """
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple, final
 
 import equinox as eqx
@@ -15,7 +16,7 @@ import numpy as np
 from jax.scipy.special import digamma, xlogy
 from jaxtyping import Array, Bool, Float, Int
 
-type Clusters = tuple[tuple[int, ...], ...]
+type Clusters = tuple[Sequence[int], ...]
 
 
 class Counts(NamedTuple):

@@ -5,12 +5,14 @@ from typing import Any, NamedTuple, Protocol
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dtprob.control.environment import Environment
-from dtprob.control.policy import Memory, Policy, check_size
+from dtprob.control.policy import Memory, Policy, TablePolicy
 from dtprob.control.rollout import Play, Trajectory, begin, play
 from dtprob.errors import InputError
+from dtprob.twin.rollout import check_size
 from dtprob.xla import warn_of_miscompilation
 
 
@@ -83,14 +85,18 @@ def train(
         budget: how much is played.
 
     Raises:
-        InputError: a budget without an environment, or with too few slots between two updates to learn from; a policy of
-            other devices, or one or a learner of smaller buffers.
+        InputError: a budget without an environment, or with too few slots between two updates to learn from; a table, or a
+            policy of other devices, or one or a learner of smaller buffers; or a training that ends with what is no number
+            (who compiles this calls `check_trained`).
     """
     warn_of_miscompilation()
     for name, value, least in (("environments", budget.environments, 1), ("length", budget.length, 2)):
         if value < least:
             raise InputError(f"budget: {name}", f"{least} or more", str(value), "Give a larger number")
     check_size(environment.kernel, learner)
+    if isinstance(policy, TablePolicy):
+        remedy = "Start from a FramePolicy, whose table dtprob.control.tabulate gives"
+        raise InputError("policy to train", "one with free parameters", "a table of chances", remedy)
     first, second, third = jax.random.split(key, 3)
     kept = learner.start(first, policy)
     now = begin(second, environment, policy, budget.environments)
@@ -108,4 +114,18 @@ def train(
     progress = jnp.arange(budget.updates) / budget.updates
     steps = jax.random.split(third, budget.updates), progress
     (arrays, _), (reward, watched) = jax.lax.scan(one, (arrays, now), steps)
-    return Trained(eqx.combine(arrays, fixed)[0], reward, watched)
+    trained = Trained(eqx.combine(arrays, fixed)[0], reward, watched)
+    check_trained(trained)
+    return trained
+
+
+def check_trained(trained: Trained) -> None:
+    """Refuse a policy whose parameters are no numbers; what is traced has none yet and is let through.
+
+    Raises:
+        InputError: such a policy.
+    """
+    leaves = [x for x in jax.tree.leaves(trained.policy) if eqx.is_inexact_array(x)]
+    if any(not isinstance(x, Tracer) and not bool(jnp.all(jnp.isfinite(x))) for x in leaves):
+        remedy = "Train at a lower rate, or with rewards that are numbers"
+        raise InputError("training", "a policy of finite parameters", "NaN or infinity", remedy)

@@ -41,7 +41,7 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
         self.action_spaces: dict[str, Any] = {agent: Discrete(2) for agent in self.possible_agents}
         self._start = eqx.filter_jit(environment.reset)
         self._move = eqx.filter_jit(environment.step)
-        self._key = jax.random.key(0)
+        self._key = jax.random.key(int(np.random.SeedSequence().generate_state(1)[0]))
         self._state: Any = None
         self._seen: Observation | None = None
 
@@ -59,7 +59,7 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
         """Start an episode with empty buffers.
 
         Args:
-            seed: where randomness starts; without it, it goes on from the last episode.
+            seed: where randomness starts; without it, it goes on from the last episode, and of the first is new each time.
             options: none are known.
         """
         del options
@@ -82,19 +82,15 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
             actions: of every device; an episode that has ended takes none.
 
         Raises:
-            InputError: no episode is under way, or a device has no action.
+            InputError: no episode is under way, or actions that are not one of each device.
         """
         if self._state is None or (not self.agents and actions):
             raise InputError("step", "an episode under way", "none", "Call reset first")
         if not self.agents:
             return {}, {}, {}, {}, {}
-        missing = [agent for agent in self.agents if agent not in actions]
-        if missing:
-            remedy = "Give an action for every device"
-            raise InputError("actions", f"one of each of {self.agents}", f"none of {missing}", remedy)
-        action = jnp.array([int(actions[agent] or 0) for agent in self.agents], jnp.int32)
+        wanted = self._wanted(actions)
         self._key, key = jax.random.split(self._key)
-        self._state, step = self._move(key, self._state, action)
+        self._state, step = self._move(key, self._state, jnp.asarray(wanted, jnp.int32))
         agents, done = self.agents, bool(step.truncated)
         self._seen = step.final_observation
         infos = {
@@ -110,6 +106,25 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
             dict.fromkeys(agents, done),
             infos,
         )
+
+    def _wanted(self, actions: Mapping[str, Any]) -> np.ndarray:
+        """The devices' actions in their order.
+
+        Raises:
+            InputError: a device without an action, an action that there is not, or one of no device of the network.
+        """
+        missing = [agent for agent in self.agents if agent not in actions]
+        if missing:
+            remedy = "Give an action for every device"
+            raise InputError("actions", f"one of each of {self.agents}", f"none of {missing}", remedy)
+        for agent, action in actions.items():
+            if agent not in self.agents:
+                raise InputError("actions", f"those of {self.agents}", f"one of {agent!r}", "Leave it out")
+            number = action if isinstance(action, int) else np.asarray(action)
+            if not self.action_space(agent).contains(number):
+                got = repr(action)
+                raise InputError(f"action of {agent}", "0 (silent) or 1 (sends)", got, "Correct it")
+        return np.array([int(actions[agent]) for agent in self.agents])
 
     def state(self) -> np.ndarray:
         """What all devices see, (device, 4)."""

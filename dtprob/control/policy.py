@@ -1,6 +1,5 @@
 """Decentralised policies: each device decides by what it sees itself and the slot of the frame."""
 
-import operator
 from typing import Any, Protocol, final
 
 import equinox as eqx
@@ -178,26 +177,6 @@ def aloha(devices: int, capacity: int, probability: float) -> TablePolicy:
 def tabulate(policy: FramePolicy) -> TablePolicy:
     """The table of a memoryless policy; it sends with the same chances."""
     return TablePolicy(jax.nn.sigmoid(jnp.moveaxis(policy.table(), -1, 0)))
-
-
-def check_size(whole: Any, part: Any) -> None:
-    """Refuse a policy or learner of other devices or smaller buffers than what it is used with: indices would be clamped.
-
-    Args:
-        whole: a kernel or a policy.
-        part: a policy or a learner; what either does not tell is not compared.
-
-    Raises:
-        InputError: the first difference.
-    """
-    for name, fits, bound in (("devices", operator.eq, ""), ("capacity", operator.ge, " or more")):
-        expected, got = getattr(whole, name, None), getattr(part, name, None)
-        if expected is not None and got is not None and not fits(got, expected):
-            what, wanted = (
-                f"{name} of {type(part).__name__}",
-                f"{expected}{bound}, as in {type(whole).__name__}",
-            )
-            raise InputError(what, wanted, str(got), "Make it with as many")
 
 
 def unroll(

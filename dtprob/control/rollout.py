@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dtprob.control.environment import Environment, Observation
-from dtprob.control.policy import Memory, Policy, act, check_size
+from dtprob.control.policy import Memory, Policy, act
 from dtprob.errors import InputError
+from dtprob.twin.rollout import check_size
 
 
 @final
@@ -24,6 +25,16 @@ class Stateless(eqx.Module):
     """
 
     policy: Policy
+
+    @property
+    def devices(self) -> int | None:
+        """How many, if the policy tells."""
+        return getattr(self.policy, "devices", None)
+
+    @property
+    def capacity(self) -> int | None:
+        """Packets that a buffer holds, if the policy tells."""
+        return getattr(self.policy, "capacity", None)
 
     def __check_init__(self) -> None:
         """Refuse a policy that remembers, since a state does not hold what it does."""

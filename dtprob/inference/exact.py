@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple, final
+from typing import Any, ClassVar, NamedTuple, cast, final
 
 import jax
 import jax.numpy as jnp
@@ -36,8 +36,8 @@ from dtprob.inference.laplace import gaussian_facts
 from dtprob.inference.posterior import Posterior, Values
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
-from dtprob.models.declaration import trace_model
-from dtprob.models.dirichlet import LogRatios, log_draws
+from dtprob.models.declaration import Site, trace_model
+from dtprob.models.dirichlet import LogRatios, LogSimplices, log_draws, log_shares
 
 type Tables = dict[str, Float[Array, "*row outcome"]]
 
@@ -176,7 +176,9 @@ def conjugate(target: Target, inputs: Inputs, key: PRNGKeyArray) -> Conjugate:
             got = f"{name!r} ({site.distribution})"
             remedy = "Use another engine, such as nuts or laplace"
             raise InputError(what, "latent sites that are Dirichlet tables in log space", got, remedy)
-    prior, allowed = _priors(what, target, inputs)
+    allowed = {name: _allowed(target.declaration.latent[name]) for name in target.coordinates}
+    points = _points(allowed, key)
+    prior = _priors(what, target, inputs, points, allowed)
     first, last = (_corner(allowed, reverse=flag) for flag in (False, True))
     gradient = target.compiled(_gradient)
     near, far = gradient(first, inputs), gradient(last, inputs)
@@ -185,25 +187,48 @@ def conjugate(target: Target, inputs: Inputs, key: PRNGKeyArray) -> Conjugate:
         counted = np.where(np.asarray(first[name]) == 0.0, far[name], near[name])
         lonely = mask.sum(axis=-1, keepdims=True) == 1
         counts[name] = np.where(mask & ~lonely, counted, 0.0)
-    return Conjugate(prior, counts, allowed, _constant(target, inputs, counts, prior, key))
+    return Conjugate(prior, counts, allowed, _constant(target, inputs, counts, points))
+
+
+def _allowed(site: Site) -> Bool[np.ndarray, "*row outcome"]:
+    """Which outcomes of a table can happen."""
+    return cast("LogSimplices", site.support).allowed
 
 
 def _what(target: Target) -> str:
     return f"model {target.declaration.name} for engine exact"
 
 
-def _priors(what: str, target: Target, inputs: Inputs) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
-    traces = [trace_model(target.model, target.data(inputs), jax.random.key(seed)) for seed in range(2)]
-    prior: dict[str, np.ndarray] = {}
-    allowed: dict[str, np.ndarray] = {}
-    for name in target.coordinates:
-        one, other = (trace[name]["fn"] for trace in traces)
-        if not np.array_equal(one.concentration, other.concentration):
+def _concentrations(target: Target, tables: Tables, inputs: Inputs) -> dict[str, Array]:
+    """The prior's concentration of each table, where the tables have these values."""
+    trace = trace_model(target.model, target.data(inputs), jax.random.key(0), tables)
+    return {name: trace[name]["fn"].concentration for name in tables}
+
+
+def _priors(
+    what: str,
+    target: Target,
+    inputs: Inputs,
+    points: list[Tables],
+    allowed: Mapping[str, Bool[np.ndarray, "..."]],
+) -> dict[str, np.ndarray]:
+    """Concentrations, 0 where an outcome cannot happen; compared at two points, which others would vary with."""
+    one, other = (target.compiled(_concentrations)(tables, inputs) for tables in points[:2])
+    for name in allowed:
+        if not np.array_equal(one[name], other[name]):
             remedy = "Use another engine, such as nuts"
             raise InputError(what, "concentrations that are known", f"one that varies at {name!r}", remedy)
-        allowed[name] = one.allowed
-        prior[name] = np.where(one.allowed, np.asarray(one.concentration), 0.0)
-    return prior, allowed
+    return {name: np.where(mask, np.asarray(one[name]), 0.0) for name, mask in allowed.items()}
+
+
+def _points(allowed: Mapping[str, Bool[np.ndarray, "..."]], key: PRNGKeyArray) -> list[Tables]:
+    """Tables drawn uniformly; in NumPy, for JAX would compile a program for each shape."""
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel())
+    points: list[Tables] = []
+    for _ in range(_POINTS):
+        weights = {n: np.where(mask, random.exponential(size=mask.shape), 0.0) for n, mask in allowed.items()}
+        points.append({name: jnp.asarray(log_shares(each, allowed[name])) for name, each in weights.items()})
+    return points
 
 
 def _corner(allowed: Mapping[str, Bool[np.ndarray, "..."]], *, reverse: bool) -> Tables:
@@ -229,19 +254,12 @@ def _gradient(target: Target, tables: Tables, inputs: Inputs) -> Tables:
 
 
 def _constant(
-    target: Target,
-    inputs: Inputs,
-    counts: Mapping[str, np.ndarray],
-    prior: Mapping[str, np.ndarray],
-    key: PRNGKeyArray,
+    target: Target, inputs: Inputs, counts: Mapping[str, np.ndarray], points: list[Tables]
 ) -> float:
-    """The likelihood's constant, after a check that it is one."""
-    uniform = DirichletTables({name: np.where(a > 0, 1.0, 0.0) for name, a in prior.items()})
-    drawn = uniform.sample(key, _POINTS)
+    """The likelihood's constant, after a check at some points that it is one."""
     rest: list[float] = []
     size = 1.0
-    for i in range(_POINTS):
-        tables = {name: jnp.asarray(value[i]) for name, value in drawn.items()}
+    for tables in points:
         value = float(target.compiled(_log_likelihood)(tables, inputs))
         powers = sum(float(np.sum(n * np.where(n > 0, tables[name], 0.0))) for name, n in counts.items())
         rest.append(value - powers)

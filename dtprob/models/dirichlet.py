@@ -121,7 +121,7 @@ class LogDirichlet(Distribution):
         allowed: which outcomes can happen.
 
     Raises:
-        InputError: a row in which nothing can happen.
+        InputError: a row in which nothing can happen, or a concentration that is not above 0.
     """
 
     arg_constraints = {"concentration": constraints.positive}  # noqa: RUF012
@@ -135,6 +135,9 @@ class LogDirichlet(Distribution):
         *,
         validate_args: bool | None = None,
     ) -> None:
+        if isinstance(concentration, int | float) and not 0 < concentration < float("inf"):
+            got = f"{concentration:g}"
+            raise InputError("concentration of a Dirichlet law", "a finite number above 0", got, "Correct it")
         self.allowed = np.asarray(allowed, dtype=bool)
         if not self.allowed.any(axis=-1).all():
             row = tuple(int(i) for i in np.argwhere(~self.allowed.any(axis=-1))[0])

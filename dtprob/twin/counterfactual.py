@@ -6,7 +6,7 @@ about one episode that happened: its luck is drawn given its log (abduction), an
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol, final
 
@@ -20,7 +20,7 @@ from dtprob.errors import InputError
 from dtprob.inference.posterior import Sampler
 from dtprob.models.multi_access.abduction import Transition, abduct
 from dtprob.models.multi_access.transition import Kernel, State
-from dtprob.twin.predict import Prediction, check_counts, sampled
+from dtprob.twin.predict import Prediction, check_counts, check_tables, sampled
 from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, rollout
 
 SITES = ("log_arrival", "log_reception")
@@ -97,12 +97,14 @@ def average_effect(
         sites: the parameters that the kernel takes.
 
     Raises:
-        InputError: counts below 1, fewer than 2 episodes, or a sampler that lacks a site.
+        InputError: counts below 1, fewer than 2 episodes, a policy or tables of another network, or a sampler that lacks a
+            site.
     """
     check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
     for arm in (baseline, alternative):
-        check_policy(arm.policy)
+        check_policy(arm.kernel or kernel, arm.policy)
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
+    check_tables(kernel, parameters)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
 
     arms = (baseline, alternative)
@@ -153,8 +155,10 @@ def transitions(episode: LogLike) -> Transition:
     They are numbered as in the log where it numbers them, else from 0.
 
     Raises:
-        InputError: slots of several episodes.
+        InputError: slots of several episodes, or columns in the place of an episode.
     """
+    if isinstance(episode, Mapping):
+        raise InputError("episode", "a NetworkLog", "columns by name", "Give NetworkLog(**columns)")
     several = len(np.unique(np.asarray(getattr(episode, "episode", 0))))
     if several > 1:
         raise InputError(
@@ -195,13 +199,16 @@ def what_if(
         The slots, each field (draw, slot, ...).
 
     Raises:
-        InputError: no draws, an episode of another network, or one that could not happen under a draw of the parameters.
+        InputError: no draws, an episode, policy or tables of another network, columns in the place of an episode, or one
+            that could not happen under a draw of the parameters.
     """
     check_counts({"draws": (draws, 1)})
-    check_policy(policy)
+    if policy is not None:
+        check_policy(kernel, policy)
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, SITES)
     happened = transitions(episode)
     _check_buffers(kernel, episode)
+    check_tables(kernel, parameters)
 
     keys = jax.random.split(jax.random.fold_in(key, 1), draws)
     slots, could = _replayed(keys, happened, parameters, kernel, policy, change=change)

@@ -13,7 +13,7 @@ from jaxtyping import Array, Float
 from numpyro import handlers
 from numpyro.infer.util import compute_log_probs
 
-from dtprob.errors import InputError
+from dtprob.errors import InputError, unknown_name
 from dtprob.models.arguments import Data, Model, split_static
 from dtprob.models.declaration import Declaration, declare
 from dtprob.xla import warn_of_miscompilation
@@ -41,15 +41,13 @@ def window_likelihoods(
         apart: axes whose entries are factors of their own, as "cluster" makes arrivals[0] and arrivals[1].
 
     Raises:
-        InputError: draws of a latent site are missing, an observed site has no such window, a window's likelihood is not a
-            number, or the model adds to it by a `numpyro.factor` of the data, which belongs to no window.
+        InputError: draws of a latent site are missing or of another shape, an observed site has no such window, an axis to
+            keep apart that no observed site has, a window's likelihood that is not a number, or a model that adds to it by
+            a `numpyro.factor` of the data, which belongs to no window.
     """
     warn_of_miscompilation()
     declaration = declare(model, data)
-    missing = [name for name in declaration.latent if name not in draws]
-    if missing:
-        remedy = "Sample them from a posterior of this model"
-        raise InputError("draws", f"every latent site of {declaration.name}", f"no {missing[0]!r}", remedy)
+    _check_draws(draws, declaration)
     _check_factors(model, data, draws, declaration)
     axis = window or declaration.cluster
     axes = {name: site.axes for name, site in declaration.observed.items()}
@@ -57,6 +55,11 @@ def window_likelihoods(
         if axis not in own:
             remedy = "Name the axis of the windows"
             raise InputError(f"windows of {name!r}", f"one of {', '.join(own)}", repr(axis), remedy)
+    check_apart(apart)
+    others = {each for own in axes.values() for each in own} - {axis}
+    for name in apart:
+        if name not in others:
+            raise unknown_name("axes to keep apart", name, others, "axis")
     latent = {name: jnp.asarray(draws[name]) for name in declaration.latent}
     arrays, static = split_static(data)
     arrays = jax.tree.map(jnp.asarray, arrays)
@@ -70,6 +73,29 @@ def window_likelihoods(
                 f"log likelihood of {label}", expected, got, "Correct the reading there, or mask it"
             )
     return told
+
+
+def check_apart(apart: Sequence[str]) -> None:
+    """Refuse one name in the place of several: its letters would be taken for axes.
+
+    Raises:
+        InputError: text.
+    """
+    if isinstance(apart, str):
+        raise InputError("axes to keep apart", "several names", repr(apart), f"Write ({apart!r},)")
+
+
+def _check_draws(draws: Mapping[str, Any], declaration: Declaration) -> None:
+    """Refuse draws that the model cannot have had; a table of other rows would be read at the wrong ones."""
+    for name, site in declaration.latent.items():
+        if name not in draws:
+            remedy = "Sample them from a posterior of this model"
+            raise InputError("draws", f"every latent site of {declaration.name}", f"no {name!r}", remedy)
+        if (found := np.shape(draws[name])[1:]) != site.shape:
+            remedy = "Give the data and options (such as traffic) that the draws were learned with"
+            raise InputError(
+                f"draws of {name!r}", f"(draw, ...) with {site.shape} each", f"{found} each", remedy
+            )
 
 
 def _check_factors(model: Model, data: Data, draws: Mapping[str, Any], declaration: Declaration) -> None:

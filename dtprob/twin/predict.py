@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from dtprob.errors import InputError
 from dtprob.inference.posterior import Sampler
+from dtprob.models.multi_access.transition import Kernel
 from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, rollout
 
 
@@ -94,11 +95,13 @@ def predict(
         sites: the parameters that the kernel takes.
 
     Raises:
-        InputError: counts below 1, fewer than 2 episodes, or a sampler that lacks a site.
+        InputError: counts below 1, fewer than 2 episodes, a policy or tables of another network, or a sampler that lacks a
+            site.
     """
     check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
-    check_policy(policy)
+    check_policy(kernel, policy)
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
+    check_tables(kernel, parameters)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
     return Prediction(np.asarray(_values(keys, parameters, kernel, policy, metric, horizon=horizon), float))
 
@@ -127,6 +130,32 @@ def sampled(key: PRNGKeyArray, sampler: Sampler, draws: int, sites: tuple[str, .
             remedy = "Take a posterior of the model that the kernel belongs to"
             raise InputError("sampler", f"draws of {site!r}", f"of {', '.join(found)}", remedy)
     return {site: jnp.asarray(found[site]) for site in sites}
+
+
+def check_tables(kernel: Steps, parameters: Parameters) -> None:
+    """Refuse tables of another multi-access network, whose rows would be clamped; of other kernels nothing is known.
+
+    Args:
+        kernel: the network.
+        parameters: its tables, each (draw, ...).
+
+    Raises:
+        InputError: a table of another shape.
+    """
+    if not isinstance(kernel, Kernel):
+        return
+    clusters = kernel.clusters
+    tables = {
+        "log_arrival": [clusters.arrival_allowed(memory=memory).shape for memory in (False, True)],
+        "log_reception": [clusters.reception_allowed().shape],
+    }
+    for name, shapes in tables.items():
+        if (found := parameters[name].shape[1:]) not in shapes:
+            expected = " or ".join(map(str, shapes))
+            remedy = "Take a posterior of the model that the kernel belongs to"
+            raise InputError(
+                f"draws of {name!r}", f"(draw, ...) with {expected} each", f"{found} each", remedy
+            )
 
 
 def check_counts(counts: Mapping[str, tuple[int, int]]) -> None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Callable, Mapping
 from typing import Any, Protocol
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dtprob.errors import InputError
@@ -18,8 +20,28 @@ type Metric = Callable[[Any], Float[Array, ""]]
 """From the slots of an episode, each field (slot, ...), to a number."""
 
 
-def check_policy(policy: object) -> None:
-    """Refuse a policy that takes what devices see in place of a key and the state.
+def check_size(whole: Any, part: Any) -> None:
+    """Refuse a policy or learner of other devices or smaller buffers than what it is used with: indices would be clamped.
+
+    Args:
+        whole: a kernel or a policy.
+        part: a policy or a learner; what either does not tell is not compared.
+
+    Raises:
+        InputError: the first difference.
+    """
+    for name, fits, bound in (("devices", operator.eq, ""), ("capacity", operator.ge, " or more")):
+        expected, got = getattr(whole, name, None), getattr(part, name, None)
+        if expected is not None and got is not None and not fits(got, expected):
+            what, wanted = (
+                f"{name} of {type(part).__name__}",
+                f"{expected}{bound}, as in {type(whole).__name__}",
+            )
+            raise InputError(what, wanted, str(got), "Make it with as many")
+
+
+def check_policy(kernel: Steps, policy: Any) -> None:
+    """Refuse a policy that takes what devices see in place of a key and the state, or of another network.
 
     Raises:
         InputError: such a policy.
@@ -27,6 +49,11 @@ def check_policy(policy: object) -> None:
     if hasattr(policy, "initial"):
         remedy = "Give dtprob.control.Stateless(policy)"
         raise InputError("policy", "a function of a key and the state", type(policy).__name__, remedy)
+    check_size(kernel, policy)
+    found = jax.eval_shape(policy, jax.random.key(0), kernel.initial())
+    if (shape := np.shape(found)) != (kernel.devices,):
+        expected = f"an action of each of {kernel.devices} devices"
+        raise InputError("policy", expected, f"actions of shape {shape}", "Give one of this network")
 
 
 class Steps(Protocol):

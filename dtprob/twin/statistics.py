@@ -65,8 +65,7 @@ def threshold(normal: Float[np.ndarray, " window"], rate: float) -> float:
         InputError: a rate outside of (0, 1), too few windows for it, one whose statistic is not a number, or so many that
             cannot be that nothing would ever be an alarm.
     """
-    if not 0 < rate < 1:
-        raise InputError("rate of false alarms", "a probability between 0 and 1", f"{rate:g}", "Correct it")
+    check_rate(rate)
     if np.isnan(normal).any():
         got = f"NaN in {int(np.isnan(normal).sum())} of {len(normal)}"
         raise InputError(
@@ -77,13 +76,23 @@ def threshold(normal: Float[np.ndarray, " window"], rate: float) -> float:
     if place > n:
         needed = int(np.ceil(1 / rate)) - 1
         remedy = "Log more normal slots, choose shorter windows, or allow more false alarms"
-        raise InputError(f"normal windows for a rate of {rate:g}", f"{needed} or more", str(n), remedy)
+        raise InputError(f"whole normal windows for a rate of {rate:g}", f"{needed} or more", str(n), remedy)
     found = float(np.sort(normal)[place - 1])
     if np.isposinf(found):
         got = f"{int(np.isposinf(normal).sum())} of {n} that cannot be under any draw"
         remedy = "Learn from windows like these, or leave out those that are not normal"
         raise InputError("normal windows", "windows that can be under what was learned", got, remedy)
     return found
+
+
+def check_rate(rate: float) -> None:
+    """Refuse what is no probability of a false alarm.
+
+    Raises:
+        InputError: a rate outside of (0, 1).
+    """
+    if not 0 < rate < 1:
+        raise InputError("rate of false alarms", "a probability between 0 and 1", f"{rate:g}", "Correct it")
 
 
 def p_value(

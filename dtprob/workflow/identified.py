@@ -56,7 +56,8 @@ def _prior_values(target: Target, key: jax.Array, inputs: Inputs) -> dict[str, j
 
 
 def _width(values: np.ndarray, *, circular: bool) -> np.ndarray:
-    """Of the middle half, by entry; NaN where all draws are the same."""
+    """Of the middle half, by entry; NaN where all draws are the same or some not finite, as of what cannot happen."""
+    values = np.where(np.isfinite(values).all(axis=0), values, 0.0)
     if not circular:
         low, high = np.quantile(values, [_MIDDLE / 2, 1 - _MIDDLE / 2], axis=0)
         return np.where(np.ptp(values, axis=0) > 0, high - low, np.nan)

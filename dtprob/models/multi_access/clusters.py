@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from numbers import Integral
@@ -30,10 +31,13 @@ class Clusters:
         InputError: devices that are not numbered from 0, each in one cluster, or a cluster of more than 12.
     """
 
-    members: tuple[tuple[int, ...], ...]
+    members: tuple[Sequence[int], ...]
 
     def __post_init__(self) -> None:
         """Check that the clusters are a partition of the devices."""
+        if not all(isinstance(c, Iterable) for c in self.members):
+            remedy = "Write a list of devices for each cluster, as in [[0, 1], [2, 3]]"
+            raise InputError("clusters", "lists of devices' numbers", str(list(self.members)), remedy)
         if any(isinstance(d, bool) or not isinstance(d, Integral) for c in self.members for d in c):
             got = str([list(c) for c in self.members])
             raise InputError("clusters", "lists of devices' numbers", got, "Correct the value")

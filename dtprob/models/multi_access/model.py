@@ -67,6 +67,7 @@ def multi_access(
     traffic: Traffic = "memoryless",
     concentration: float = 0.01,
     acknowledged: Int[Array, "episode slot cluster"] | None = None,  # noqa: ARG001 -- read by effects
+    preceded: Bool[Array, "episode slot"] | None = None,
     arrivals: Int[Array, "episode slot cluster"] | None = None,
     deliveries: Int[Array, "episode slot"] | None = None,
     successes: Int[Array, "episode slot device"] | None = None,
@@ -87,6 +88,8 @@ def multi_access(
         concentration: of the Dirichlet priors of all tables.
         acknowledged: whose packets were delivered in the slot before, numbered as `previous`. The tables do not depend on
             it; traffic that waits for an acknowledgement is an effect, `closed_loop_traffic`.
+        preceded: whether the slot before is known, as it is not after a gap; everywhere by default. Where it is not, what
+            the arrivals depend on is not known, and they do not count.
         arrivals: joint arrivals of each cluster at the end of the slot.
         deliveries: number of packets delivered in the slot.
         successes: 1 where a device's packet was delivered.
@@ -104,10 +107,11 @@ def multi_access(
     def reception(columns: Columns) -> Array:
         return look_up(reception_table, [jnp.sum(columns["sending"], axis=-1)])
 
-    columns: dict[str, Any] = {"sending": sending, "previous": previous, "valid": valid}
+    traced = valid if preceded is None else valid & jnp.asarray(preceded, bool)
+    columns: dict[str, Any] = {"sending": sending, "previous": previous, "valid": valid, "traced": traced}
     columns |= {"arrivals": arrivals, "deliveries": deliveries}
     factors = (
-        Factor("arrival", "arrivals", ("previous",), arrival, ("cluster",), "valid"),
+        Factor("arrival", "arrivals", ("previous",), arrival, ("cluster",), "traced"),
         Factor("reception", "deliveries", ("sending",), reception, (), "valid"),
     )
     drawn = draw_factors(factors, {k: v for k, v in columns.items() if v is not None})

@@ -30,7 +30,9 @@ def records(
             diagnosis, a monitor or a held-out score looks.
 
     Returns:
-        `sending`, `previous`, `acknowledged`, `valid`, `arrivals`, `deliveries`, `successes`, and `clusters` as `Clusters`.
+        `sending`, `previous`, `acknowledged`, `preceded`, `valid`, `arrivals`, `deliveries`, `successes`, and `clusters` as
+        `Clusters`. `preceded` is false in the first row of an episode that does not begin at slot 0: what came before it is
+        not in the log.
 
     Raises:
         InputError: devices in the log and in the clusters that do not match, a window below 1, or a buffer that the
@@ -38,7 +40,7 @@ def records(
         TypeError: a window or capacity that is no whole number.
     """
     window, capacity = operator.index(window), operator.index(capacity)
-    known = Clusters(tuple(tuple(cluster) for cluster in clusters))
+    known = Clusters(tuple(clusters))
     devices = log.buffer.shape[1]
     if known.devices != devices:
         remedy = "Put every device of the log into one cluster"
@@ -51,6 +53,7 @@ def records(
         "sending": (log.action > 0) & (log.buffer > 0),
         "previous": _slot_before(log, log.arrival) @ known.weight.T,
         "acknowledged": _slot_before(log, log.ack) @ known.weight.T,
+        "preceded": follows(log) | (log.slot == 0),
         "valid": np.ones(len(log.slot), dtype=bool),
         "arrivals": log.arrival @ known.weight.T,
         "deliveries": log.ack.sum(axis=1),
@@ -78,13 +81,15 @@ def window_counts(arguments: Mapping[str, Any], *, memory: bool = False) -> dict
     """
     clusters: Clusters = arguments["clusters"]
     valid = np.asarray(arguments["valid"], bool)
-    episode = np.broadcast_to(np.arange(len(valid))[:, None], valid.shape)[valid]
-    arrivals, previous = (np.asarray(arguments[name])[valid] for name in ("arrivals", "previous"))
+    number = np.broadcast_to(np.arange(len(valid))[:, None], valid.shape)
+    traced = valid & np.asarray(arguments.get("preceded", valid), bool)
+    arrivals, previous = (np.asarray(arguments[name])[traced] for name in ("arrivals", "previous"))
     shape = clusters.arrival_allowed(memory=memory).shape
     arrival = np.zeros((len(valid), *shape))
     last = previous if memory else np.zeros_like(previous)
-    place: Any = (episode[:, None], np.arange(shape[0]), last, arrivals)
+    place: Any = (number[traced][:, None], np.arange(shape[0]), last, arrivals)
     np.add.at(arrival, place, 1.0)
+    episode = number[valid]
     senders = np.asarray(arguments["sending"])[valid].sum(axis=-1)
     reception = np.zeros((len(valid), clusters.devices + 1, clusters.devices + 1))
     np.add.at(reception, (episode, senders, np.asarray(arguments["deliveries"])[valid]), 1.0)

@@ -6,6 +6,7 @@ run again with the same luck and other parameters or actions.
 
 from __future__ import annotations
 
+import operator
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple, final
 
@@ -147,10 +148,12 @@ def kernel(clusters: Sequence[Sequence[int]], capacity: int = 1) -> Kernel:
 
     Raises:
         InputError: devices not numbered from 0, each in one cluster, or a capacity below 1.
+        TypeError: a capacity that is no whole number.
     """
+    capacity = operator.index(capacity)
     if capacity < 1:
         raise InputError("capacity of the buffers", "1 packet or more", str(capacity), "Give a larger number")
-    return Kernel(Clusters(tuple(tuple(cluster) for cluster in clusters)), capacity)
+    return Kernel(Clusters(tuple(clusters)), capacity)
 
 
 def invert(log_probability: Float[Array, " outcome"], uniform: Float[Array, ""]) -> Int[Array, ""]:

@@ -51,7 +51,7 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
         }
         self.action_spaces: dict[str, Any] = {agent: Discrete(2) for agent in self.possible_agents}
         self._stages, self._horizon = list(stages), horizon
-        self._random, self._total, self._begun = np.random.default_rng(0), 0, False
+        self._random, self._total, self._begun = np.random.default_rng(), 0, False
         self._seen = np.zeros((first.devices, 4), np.int64)
 
     def observation_space(self, agent: str) -> gymnasium.Space[np.ndarray]:
@@ -68,7 +68,7 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
         """Start an episode with empty buffers.
 
         Args:
-            seed: where randomness starts, and the first stage anew; without it, things go on.
+            seed: where randomness starts, and the first stage anew; without it, things go on, with new luck in the first.
             options: none are known.
         """
         del options
@@ -89,19 +89,15 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
             actions: of every device; an episode that has ended takes none.
 
         Raises:
-            InputError: no episode is under way, or a device has no action.
+            InputError: no episode is under way, or actions that are not one of each device.
         """
         agents = self.agents
         if not self._begun or (not agents and actions):
             raise InputError("step", "an episode under way", "none", "Call reset first")
         if not agents:
             return {}, {}, {}, {}, {}
-        missing = [agent for agent in agents if agent not in actions]
-        if missing:
-            remedy = "Give an action for every device"
-            raise InputError("actions", f"one of each of {agents}", f"none of {missing}", remedy)
+        wanted = self._wanted(actions)
         network = [net for start, net in self._stages if start <= self._total][-1]
-        wanted = np.array([int(actions[agent] or 0) for agent in agents])
         ack, arrival = self._luck(network, (wanted > 0) & (self._seen[:, 0] > 0))
         full = self._seen[:, 0] + arrival - ack
         overflow = full > network.capacity
@@ -123,6 +119,25 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
             dict.fromkeys(agents, done),
             infos,
         )
+
+    def _wanted(self, actions: Mapping[str, Any]) -> np.ndarray:
+        """The devices' actions in their order.
+
+        Raises:
+            InputError: a device without an action, an action that there is not, or one of no device of the network.
+        """
+        missing = [agent for agent in self.agents if agent not in actions]
+        if missing:
+            remedy = "Give an action for every device"
+            raise InputError("actions", f"one of each of {self.agents}", f"none of {missing}", remedy)
+        for agent, action in actions.items():
+            if agent not in self.agents:
+                raise InputError("actions", f"those of {self.agents}", f"one of {agent!r}", "Leave it out")
+            number = action if isinstance(action, int) else np.asarray(action)
+            if not self.action_space(agent).contains(number):
+                got = repr(action)
+                raise InputError(f"action of {agent}", "0 (silent) or 1 (sends)", got, "Correct it")
+        return np.array([int(actions[agent]) for agent in self.agents])
 
     def state(self) -> np.ndarray:
         """What all devices see, (device, 4)."""

@@ -12,6 +12,7 @@ from dtprob.data import NetworkLog
 from dtprob.inference.exact import DirichletTables
 from dtprob.models.dirichlet import log_marginal
 from dtprob.models.multi_access import priors, records, window_counts
+from dtprob.models.multi_access.records import WINDOW
 from dtprob.twin import statistics
 from dtprob.workflow.loop.physical import Rows
 from dtprob.workflow.loop.settings import TwinCase
@@ -35,15 +36,16 @@ def log_of(rows: Rows, first: int = 0, last: int | None = None) -> NetworkLog:
     return NetworkLog(**{name: column[first:last] for name, column in rows.items()})
 
 
-def row_counts(case: TwinCase, rows: Rows) -> dict[str, Float[np.ndarray, "row ..."]]:
-    """How often each row saw each entry of the tables; once, that is.
+def row_counts(
+    case: TwinCase, rows: Rows, first: int = 0, last: int | None = None
+) -> dict[str, Float[np.ndarray, "row ..."]]:
+    """How often each of some rows saw each entry of the tables; once, that is.
 
     Raises:
         InputError: rows that cannot be.
     """
-    kernel = case.kernel
-    arguments = records(log_of(rows), clusters=kernel.clusters.members, capacity=kernel.capacity, window=1)
-    return window_counts(arguments, memory=case.memory)
+    counts = window_counts(_recorded(case, rows, first, last, 1), memory=case.memory)
+    return {name: each[min(first, 1) :] for name, each in counts.items()}
 
 
 def known(case: TwinCase, state: State, last: int | None = None) -> DirichletTables:
@@ -51,8 +53,17 @@ def known(case: TwinCase, state: State, last: int | None = None) -> DirichletTab
     law = DirichletTables(state.prior)
     if state.since >= (state.slots if last is None else last):
         return law
-    counts = row_counts(case, state.rows)
-    return law.updated({name: each[state.since : last].sum(axis=0) for name, each in counts.items()})
+    counts = window_counts(_recorded(case, state.rows, state.since, last, WINDOW), memory=case.memory)
+    return law.updated({name: each.sum(axis=0) for name, each in counts.items()})
+
+
+def _recorded(case: TwinCase, rows: Rows, first: int, last: int | None, window: int) -> dict[str, Any]:
+    """The model's arguments from some rows, with one more before them that tells what arrived last, but does not count."""
+    kernel = case.kernel
+    log = log_of(rows, max(first - 1, 0), last)
+    arguments = records(log, clusters=kernel.clusters.members, capacity=kernel.capacity, window=window)
+    arguments["valid"][0, 0] = first == 0
+    return arguments
 
 
 def factors(counts: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
@@ -78,29 +89,43 @@ class Watched(NamedTuple):
 
 
 def watch(case: TwinCase, state: State) -> Watched:
-    """Judge the windows since the policy was handed over, by the exact evidence of new tables against those learned.
+    """Judge the windows that are watched, by the exact evidence of new tables against those learned from all rows before.
 
     A Shiryaev-Roberts detector with one new law for all windows since each possible time of a change: what they have in
-    common counts, so that a small change that lasts is found too.
+    common counts, so that a small change that lasts is found too. Of windows that were judged before, `state.detector`
+    tells.
     """
     width = case.loop.window
-    count = (state.slots - state.handed) // width
-    every = factors(row_counts(case, state.rows))
-    learned = factors(known(case, state, state.handed).concentration)
-    fresh = factors(priors(case.kernel.clusters, case.concentration, memory=case.memory))
-    evidence: dict[str, Float[np.ndarray, "window lag"]] = {}
-    for name, rows in every.items():
-        own = rows[state.handed : state.handed + count * width]
-        windows = own.reshape(count, width, *own.shape[1:]).sum(axis=1)
-        evidence[name] = evidence_since(fresh[name], learned[name], windows)
-    mixed = statistics.mixed(evidence)
-    path = np.asarray(special.logsumexp(mixed, axis=1))
+    count = (state.slots - state.watched) // width
+    judged = len(state.detector)
+    path = state.detector
+    if count > judged:
+        mixed = statistics.mixed(_evidence(case, state, judged, count))
+        path = np.concatenate([path, np.asarray(special.logsumexp(mixed, axis=1))])
     crossed = np.flatnonzero(path >= np.log(case.loop.run_length))
     alarm = int(crossed[0]) if crossed.size else None
     last = count - 1 if alarm is None else alarm
-    changed = state.handed + width * (last - int(np.argmax(mixed[last])))
-    blame = statistics.shares({n: float(np.asarray(special.logsumexp(e[last]))) for n, e in evidence.items()})
+    final = {name: each[0] for name, each in _evidence(case, state, last, last + 1).items()}
+    changed = state.watched + width * (last - int(np.argmax(statistics.mixed(final))))
+    blame = statistics.shares(
+        {name: float(np.asarray(special.logsumexp(each))) for name, each in final.items()}
+    )
     return Watched(path, alarm, changed, blame)
+
+
+def _evidence(
+    case: TwinCase, state: State, begin: int, end: int
+) -> dict[str, Float[np.ndarray, "window lag"]]:
+    """`evidence_since` of each factor in some of the windows that are watched."""
+    width, oldest = case.loop.window, max(0, begin + 1 - _LONGEST)
+    first, last = (state.watched + number * width for number in (oldest, end))
+    learned = factors(known(case, state, first).concentration)
+    fresh = factors(priors(case.kernel.clusters, case.concentration, memory=case.memory))
+    found: dict[str, Float[np.ndarray, "window lag"]] = {}
+    for name, rows in factors(row_counts(case, state.rows, first, last)).items():
+        windows = rows.reshape(end - oldest, width, *rows.shape[1:]).sum(axis=1)
+        found[name] = evidence_since(fresh[name], learned[name], windows)[begin - oldest :]
+    return found
 
 
 def evidence_since(
@@ -108,13 +133,23 @@ def evidence_since(
     learned: Float[np.ndarray, "*row outcome"],
     windows: Float[np.ndarray, "window *row outcome"],
 ) -> Float[np.ndarray, "window lag"]:
-    """Log Bayes factors of a new law against the learned one for all of a window and the `lag` windows before it."""
+    """Log Bayes factors of a new law against the known one for all of a window and the `lag` windows before it.
+
+    What is known then is what was learned and all windows before these, so that what comes after a change is compared with
+    ever more of what came before. While all come from one network of the learned law, the exponential's mean is 1.
+
+    Args:
+        fresh: concentrations of the tables that a change brings.
+        learned: those of the tables before the first window.
+        windows: how often each outcome happened.
+    """
     total = np.concatenate([np.zeros_like(windows[:1]), np.cumsum(windows, axis=0)])
+    known_law = log_marginal(learned, total).reshape(len(total), -1).sum(axis=1)
     found = np.full((len(windows), min(_LONGEST, len(windows))), -np.inf)
-    for end in range(len(windows)):
-        counts = total[end + 1] - total[max(0, end + 1 - _LONGEST) : end + 1][::-1]
-        gain = log_marginal(fresh, counts) - log_marginal(learned, counts)
-        found[end, : len(counts)] = gain.reshape(len(counts), -1).sum(axis=1)
+    for end in range(1, len(total)):
+        starts = np.arange(end)[::-1][:_LONGEST]
+        new_law = log_marginal(fresh, total[end] - total[starts]).reshape(len(starts), -1).sum(axis=1)
+        found[end - 1, : len(starts)] = new_law - (known_law[end] - known_law[starts])
     return found
 
 

@@ -5,7 +5,6 @@ from typing import Final, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
@@ -14,16 +13,14 @@ from dtprob.control import (
     Budget,
     Environment,
     FramePolicy,
-    Stateless,
-    TablePolicy,
     collector,
     draw_pool,
     tabulate,
     train,
 )
-from dtprob.twin.predict import Prediction, predict
-from dtprob.twin.rollout import throughput
+from dtprob.control.learner import check_trained
 from dtprob.workflow.loop.diagnosis import diagnosed
+from dtprob.workflow.loop.foresight import FEW, HORIZON, foresee, shortfall
 from dtprob.workflow.loop.knowledge import Watched, forget, known, summary, watch
 from dtprob.workflow.loop.physical import Chances, Physical
 from dtprob.workflow.loop.settings import TwinCase
@@ -32,8 +29,6 @@ from dtprob.workflow.loop.state import Entry, Phase, State
 type Say = Callable[[str], None]
 
 _HORIZON, _REDRAW, _POOL = 2000, 200, 256
-_FORESEEN: Final = 200
-"""Slots over which the throughput is foreseen."""
 _WINDOWS_AT_ONCE: Final = 5
 
 
@@ -91,41 +86,66 @@ def control(twin: Twin, state: State) -> State:
     environment = Environment(kernel, pool, _HORIZON, _REDRAW)
     learner = COMA(caution=loop.caution or 0.0, capacity=kernel.capacity)
     start = FramePolicy(second, kernel.devices, capacity=kernel.capacity)
-    policy = tabulate(_train(third, learner, start, environment, _budget(loop.training, 20)).policy)
+    trained = _train(third, learner, start, environment, _budget(loop.training, 20))
+    check_trained(trained)
+    policy = tabulate(trained.policy)
     after = state._replace(trained=np.asarray(policy.probability, float))
     entry = {"why": f"{_POOL} networks that may be, {loop.training} virtual slots"}
     return _next(twin, state, after, "hand_over", entry)
 
 
 def hand_over(twin: Twin, state: State) -> State:
-    """Give the devices the trained policy, if it is foreseen to deliver more than the one they have."""
-    old, new = (_foreseen(twin, state, policy) for policy in (state.policy, state.trained))
-    better = new.mean > old.mean
-    after = state._replace(policy=state.trained if better else state.policy, handed=state.slots, changed=-1)
-    low, high = new.interval()
+    """Give the devices the trained policy, if it is foreseen to deliver more than the one that they have."""
+    key = _key(twin.case, state)
+    old, new = (foresee(key, twin.case, state, policy) for policy in (state.policy, state.trained))
+    better = new.throughput.mean > old.throughput.mean
+    kept = new if better else old
+    after = state._replace(
+        policy=state.trained if better else state.policy,
+        foreseen=kept.throughput.values.ravel(),
+        handed=state.slots,
+        watched=state.slots if state.watched < 0 else state.watched,
+        changed=-1,
+    )
+    means = new.throughput.mean, old.throughput.mean
+    low, high = new.throughput.interval()
     entry = {
-        "why": f"foreseen over {_FORESEEN} slots: {new.mean:.3f} packets per slot, with the old one {old.mean:.3f}",
+        "why": f"foreseen over {HORIZON} slots: {means[0]:.3f} packets per slot, with the old one {means[1]:.3f}",
         "handed_over": better,
-        "foreseen": {"mean": round(new.mean, 4), "low": round(low, 4), "high": round(high, 4)},
-        "foreseen_with_old": round(old.mean, 4),
+        "foreseen": {"mean": round(means[0], 4), "low": round(low, 4), "high": round(high, 4)},
+        "foreseen_with_old": round(means[1], 4),
+        "seldom_seen": {"rows_seen_fewer_times_than": FEW, "share_of_foreseen_slots": round(new.seldom, 4)},
     }
     return _next(twin, state, after, "monitor", entry)
 
 
 def monitor(twin: Twin, state: State) -> State:
-    """Play the policy, some windows at a time, until the evidence for a change is enough or the slots are used up."""
+    """Play the policy until the network changes or delivers less than foreseen, or the slots are used up."""
     loop = twin.case.loop
     after = _played(twin, state, state.policy, min(_WINDOWS_AT_ONCE * loop.window, loop.slots - state.slots))
     over = after.slots >= loop.slots or after.slots == state.slots
-    seen = watch(twin.case, after) if after.slots - after.handed >= loop.window else None
+    seen = watch(twin.case, after) if after.slots - after.watched >= loop.window else None
     calls = seen is not None and seen.alarm is not None
-    if not over and not (calls and loop.relearn):
+    if seen is not None:
+        after = after._replace(detector=seen.detector)
+    # a log does not follow the policy
+    short = None if twin.case.physical.log is not None else shortfall(after)
+    if not over and not ((calls or short) and loop.relearn):
         return after._replace(step=state.step + 1)
-    entry: Entry = {"why": "no slots are left", "alarm": calls, **_throughput(after, after.handed)}
+    entry: Entry = {
+        "why": "no slots are left",
+        "alarm": calls,
+        **_throughput(after, after.handed),
+        **(short or {}),
+    }
+    phase: Phase = "done"
     if seen is not None and seen.alarm is not None:
-        entry |= _alarm(seen, state.handed + (seen.alarm + 1) * loop.window)
+        entry |= _alarm(seen, state.watched + (seen.alarm + 1) * loop.window)
         after = after._replace(changed=seen.changed)
-    phase: Phase = "diagnose" if calls and loop.relearn else "done"
+        phase = "diagnose" if loop.relearn else "done"
+    elif short and not over:
+        after = after._replace(round=state.round + 1)
+        phase = "learn"
     return _next(twin, state._replace(rows=_until(state, state.handed)), after, phase, entry)
 
 
@@ -142,7 +162,9 @@ def diagnose(twin: Twin, state: State) -> State:
             entry |= diagnosed(case, after, _key(case, state), twin.say)
     prior, gone = forget(case, after, blame)
     entry["forgotten"] = list(gone)
-    after = after._replace(prior=prior, since=state.changed, round=state.round + 1)
+    after = after._replace(
+        prior=prior, since=state.changed, watched=-1, detector=np.zeros(0), round=state.round + 1
+    )
     return _next(twin, state, after, "collect" if after.slots < loop.slots else "done", entry)
 
 
@@ -176,19 +198,6 @@ def _played(twin: Twin, state: State, policy: Chances, slots: int) -> State:
 
 def _until(state: State, last: int) -> dict[str, np.ndarray]:
     return {name: column[:last] for name, column in state.rows.items()}
-
-
-def _foreseen(twin: Twin, state: State, policy: Chances) -> Prediction:
-    return predict(
-        _key(twin.case, state),
-        twin.case.kernel,
-        known(twin.case, state),
-        policy=Stateless(TablePolicy(jnp.asarray(policy, jnp.result_type(float)))),
-        metric=throughput,
-        horizon=_FORESEEN,
-        draws=100,
-        episodes=4,
-    )
 
 
 def _throughput(state: State, first: int) -> Entry:

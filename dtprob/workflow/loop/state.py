@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 from dtprob.edition import edition
 from dtprob.errors import InputError
@@ -20,7 +21,7 @@ type Tables = Mapping[str, np.ndarray]
 """Dirichlet concentrations of `log_arrival` and `log_reception`."""
 type Entry = dict[str, Any]
 
-_PLAIN = ("phase", "step", "round", "since", "handed", "changed", "entries")
+_PLAIN = ("phase", "step", "round", "since", "handed", "watched", "changed", "entries")
 
 
 class State(NamedTuple):
@@ -35,7 +36,10 @@ class State(NamedTuple):
         prior: what was known of the tables before these rows.
         policy: what the devices follow; the chances of sending.
         trained: a policy that is not handed over yet.
-        handed: the row from which on the policy is watched.
+        foreseen: packets per slot of the episodes that were foreseen of the policy, see `foresight`.
+        handed: the row from which on the policy is followed.
+        watched: the row from which on the network is watched; -1 before that.
+        detector: of the monitor, after each window that was judged; see `knowledge.watch`.
         changed: the row from which on the network is thought to be another; -1 without an alarm.
         entries: the history.
     """
@@ -48,7 +52,10 @@ class State(NamedTuple):
     prior: Tables
     policy: Chances
     trained: Chances
+    foreseen: Float[np.ndarray, " episode"]
     handed: int
+    watched: int
+    detector: Float[np.ndarray, " window"]
     changed: int
     entries: tuple[Entry, ...]
 
@@ -65,13 +72,13 @@ def begin(case: TwinCase) -> State:
     rows = {name: wide if name not in {"episode", "slot"} else wide[:, 0] for name in COLUMNS}
     silent = np.zeros((1, kernel.devices, kernel.capacity + 1, 2, 2))
     prior = priors(kernel.clusters, case.concentration, memory=case.memory)
-    return State("collect", 0, 1, rows, 0, prior, silent, silent, 0, -1, ())
+    return State("collect", 0, 1, rows, 0, prior, silent, silent, np.zeros(0), 0, -1, np.zeros(0), -1, ())
 
 
 def save(state: State, case: TwinCase, path: Path) -> None:
     """Write a state; numbers and text only."""
     plain = {name: getattr(state, name) for name in _PLAIN}
-    arrays = {"policy": state.policy, "trained": state.trained}
+    arrays = {name: getattr(state, name) for name in ("policy", "trained", "foreseen", "detector")}
     arrays |= {f"rows.{name}": column for name, column in state.rows.items()}
     arrays |= {f"prior.{name}": table for name, table in state.prior.items()}
     with atomic_write(path) as file:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import dtprob.control.policy as tables
 from dtprob.control import COMA, IPPO, Budget, FramePolicy, HistoryPolicy, tabulate, train
 from dtprob.control.coma import actor_loss, critic_loss, values
 from dtprob.control.critic import CentralCritic
@@ -177,6 +178,19 @@ def test_a_budget_that_teaches_nothing_is_refused():
     """The return of a trajectory's last slot is a guess: with one slot between two updates nothing would be learned."""
     with pytest.raises(InputError, match="length: expected 2 or more, got 1"):
         train(KEY, COMA(), FramePolicy(KEY, 2), world(PAIR), Budget(100, 4, 1))
+
+
+def test_what_cannot_be_trained_is_refused():
+    """A table has chances of 0 and 1, whose log-odds have no slope."""
+    for table in (tables.aloha(2, 1, 0.5), tables.tdma(2, 1, [[0], [1]])):
+        with pytest.raises(InputError, match=r"policy to train: .* Start from a FramePolicy"):
+            train(KEY, COMA(), table, world(PAIR), Budget(100, 4, 2))
+    broken = jax.tree.map(lambda x: x * jnp.nan if eqx.is_array(x) else x, FramePolicy(KEY, 2))
+    with pytest.raises(InputError, match="training: expected a policy of finite parameters"):
+        train(KEY, COMA(), broken, world(PAIR), Budget(100, 4, 2))
+    for caution in (float("nan"), float("inf"), -1.0):
+        with pytest.raises(InputError, match="caution: expected a finite number, 0 or more"):
+            COMA(caution=caution)
 
 
 def test_guessed_slots_take_no_part_in_the_scale_of_advantages():

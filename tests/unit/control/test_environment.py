@@ -120,6 +120,27 @@ def test_pettingzoo_truncates_and_shows_the_final_observation():
     assert network.step({}) == ({}, {}, {}, {}, {})
 
 
+def test_without_a_seed_each_network_has_luck_of_its_own():
+    played = []
+    for _ in range(2):
+        network = ParallelNetwork(world(NETWORK, horizon=60))
+        network.reset()
+        played.append([network.step(dict.fromkeys(network.agents, 1))[0]["device_0"] for _ in range(50)])
+    assert not np.array_equal(*played)
+
+
+@pytest.mark.parametrize("action", [7, -1, 0.9, float("nan"), None, "1"])
+def test_actions_that_there_are_not_are_refused(action):
+    network = ParallelNetwork(world(NETWORK, horizon=3))
+    network.reset(seed=1)
+    everyone = dict.fromkeys(network.agents, np.int64(1))
+    with pytest.raises(InputError, match=r"action of device_0: expected 0 \(silent\) or 1 \(sends\)"):
+        network.step({**everyone, "device_0": action})
+    with pytest.raises(InputError, match="one of 'device_9'"):
+        network.step({**everyone, "device_9": 1})
+    assert network.step(everyone)[0]["device_0"][3] == 1
+
+
 def test_devices_sample_actions_of_their_own():
     network = ParallelNetwork(world(NETWORK, horizon=3))
     network.reset(seed=1)

@@ -9,7 +9,7 @@ import pytest
 from scipy import special
 
 from dtprob.errors import InputError
-from dtprob.inference import NUTS, Point
+from dtprob.inference import LATENTS_ONLY, NUTS, Point
 from dtprob.inference.exact import DirichletTables, Exact
 from dtprob.models.dirichlet import LogDirichlet
 from dtprob.models.factored import Factor, Logistic, Table, factored
@@ -109,3 +109,30 @@ def test_a_sharp_unknown_hides_none_that_is_not_normal():
     data = {"y": jnp.asarray(0.01 * np.random.default_rng(0).normal(size=4000)), "c": jnp.ones(10, int)}
     with pytest.raises(InputError, match="a log density that is not quadratic"):
         Exact()(KEY, model, data)
+
+
+def test_a_closed_form_compiles_few_programs():
+    """Concentrations and the points of the check are no draws of JAX, which compiles a program for each shape."""
+    compiled = []
+
+    def note(event, *_, **__):
+        compiled.append(event)
+
+    data = records(simulate(60, 1), clusters=((0, 1, 2), (3,)), window=13)
+    jax.monitoring.register_event_duration_secs_listener(note)
+    try:
+        Exact(draws=50)(KEY, multi_access, data, options=LATENTS_ONLY)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(note)
+    assert 0 < compiled.count("/jax/core/compile/backend_compile_duration") < 130
+
+
+def test_a_concentration_that_varies_with_another_table_is_refused():
+    def nested(y=None):
+        first = numpyro.sample("first", LogDirichlet(1.0, np.ones(3, dtype=bool)))
+        second = numpyro.sample("second", LogDirichlet(1.0 + jnp.exp(first[1]), np.ones(2, dtype=bool)))
+        with numpyro.plate("toss", 4):
+            numpyro.sample("y", dist.Categorical(logits=second), obs=y)
+
+    with pytest.raises(InputError, match="concentrations that are known, got one that varies at 'second'"):
+        Exact()(KEY, nested, {"y": jnp.array([0, 1, 0, 0])})

@@ -1,10 +1,16 @@
 """The multi-access system as a model and as a kernel: laws, counts, and agreement of the two."""
 
+from dataclasses import fields
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from numpyro import handlers
+from numpyro.infer.util import compute_log_probs
 
+from dtprob.data import NetworkLog
+from dtprob.data.network import from_columns
 from dtprob.errors import InputError
 from dtprob.models.declaration import declare
 from dtprob.models.multi_access import Clusters, kernel, multi_access, records, window_counts
@@ -59,6 +65,42 @@ def test_counts(log):
     assert np.array_equal(total, [np.bincount(joint[:, c], minlength=4) for c in range(2)])
     senders = ((log.action > 0) & (log.buffer > 0)).sum(axis=1)
     assert np.array_equal(counts["log_reception"].sum(axis=(0, 2)), np.bincount(senders, minlength=5))
+
+
+def test_after_a_gap_arrivals_do_not_count():
+    """What came before the first slot after a gap is not known; by enumeration of the pairs of slots in the log."""
+    random = np.random.default_rng(0)
+    arrival = np.zeros(400, int)
+    for slot in range(1, 400):
+        arrival[slot] = random.random() < (0.8 if arrival[slot - 1] else 0.1)
+    kept = np.flatnonzero(random.random(400) < 0.7)
+    buffer = np.concatenate([[0], np.maximum.accumulate(arrival)[:-1]])  # of a device that never sends
+    columns = {"slot": kept, "arrival_0": arrival[kept], "buffer_0": buffer[kept]}
+    columns |= {name: np.zeros_like(kept) for name in ("episode", "action_0", "ack_0")}
+    arguments = records(from_columns(columns, allow_gaps=True), clusters=((0,),), window=10)
+    expected = np.zeros((2, 2))
+    for slot in kept:
+        if slot == 0 or slot - 1 in kept:
+            expected[arrival[slot - 1] if slot else 0, arrival[slot]] += 1
+    counts = {name: value.sum(axis=0) for name, value in window_counts(arguments, memory=True).items()}
+    assert np.array_equal(counts["log_arrival"][0], expected)
+    assert counts["log_reception"].sum() == len(kept)
+    tables = {
+        "log_arrival": jnp.log(jnp.array([[[0.7, 0.3], [0.4, 0.6]]])),
+        "log_reception": jnp.zeros((2, 2)),
+    }
+    given = {**arguments, "traffic": "markov"}
+    fixed = handlers.substitute(handlers.seed(multi_access, jax.random.key(0)), data=tables)
+    found = compute_log_probs(fixed, (), given, {})[0]["arrivals"]
+    np.testing.assert_allclose(found, np.sum(expected * np.asarray(tables["log_arrival"][0])), rtol=1e-6)
+
+
+def test_a_log_from_the_first_slot_on_is_known_throughout(log):
+    arguments = records(log, clusters=CLUSTERS, window=7)
+    assert np.array_equal(arguments["preceded"], arguments["valid"])
+    later = NetworkLog(**{field.name: getattr(log, field.name)[20:] for field in fields(log)})
+    cut = records(later, clusters=CLUSTERS, window=7)
+    assert np.argwhere(cut["preceded"] != cut["valid"]).tolist() == [[0, 0]]
 
 
 def test_kernel_follows_the_laws():
@@ -118,6 +160,7 @@ def test_who_is_delivered_is_the_conditional_bernoulli_law():
     [
         (((0, 1), (1, 2)), "clusters: expected each device once"),
         (((0, 2),), "clusters: expected each device once"),
+        ((0, 1), "clusters: expected lists of devices' numbers, got \\[0, 1\\]"),
         (((0.5, 1),), "clusters: expected lists of devices' numbers"),
         (((False, True),), "clusters: expected lists of devices' numbers"),
         ((tuple(range(13)),), "clusters: expected at most 12 devices each, got 13"),
@@ -126,6 +169,19 @@ def test_who_is_delivered_is_the_conditional_bernoulli_law():
 def test_clusters_that_are_no_partition_are_refused(members, message):
     with pytest.raises(InputError, match=message):
         Clusters(members)
+
+
+def test_what_is_no_capacity_or_concentration_is_refused(log):
+    with pytest.raises(InputError, match="clusters: expected lists of devices' numbers"):
+        kernel((0, 1))
+    with pytest.raises(TypeError, match="integer"):
+        kernel(((0,), (1,)), 1.5)
+    with pytest.raises(InputError, match="clusters: expected lists of devices' numbers"):
+        records(log, clusters=[0, 1, 2, 3])
+    with pytest.raises(
+        InputError, match="concentration of a Dirichlet law: expected a finite number above 0"
+    ):
+        declare(multi_access, {**records(log, clusters=CLUSTERS), "concentration": 0.0})
 
 
 def test_a_log_that_does_not_fit_is_refused(log):

@@ -1,5 +1,7 @@
 """A monitor on any model and sampler: likelihoods, thresholds, which factor changed."""
 
+from dataclasses import fields
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -7,10 +9,12 @@ import numpyro
 import numpyro.distributions as dist
 import pytest
 
+from dtprob.data import NetworkLog
+from dtprob.data.network_rows import split_gaps
 from dtprob.errors import InputError
 from dtprob.inference.exact import DirichletTables
 from dtprob.models.dirichlet import log_shares
-from dtprob.models.multi_access import multi_access, priors, records, window_counts
+from dtprob.models.multi_access import Clusters, multi_access, priors, records, window_counts
 from dtprob.twin.likelihood import table_likelihoods, window_likelihoods
 from dtprob.twin.monitor import Monitor
 from dtprob.twin.statistics import threshold
@@ -91,9 +95,62 @@ def test_what_cannot_be_watched_is_refused(monitor, learned):
         Monitor(multi_access, monitor.draws, statistic="evidence")
     with pytest.raises(InputError, match="expected 1 window or more, got 0"):
         Monitor(multi_access, monitor.draws, run_length=0.0)
+    with pytest.raises(
+        InputError, match="rate of false alarms: expected a probability between 0 and 1, got 5"
+    ):
+        Monitor(multi_access, monitor.draws, rate=5.0)
+    with pytest.raises(InputError, match=r"several names, got 'cluster'. Write \('cluster',\)"):
+        Monitor(multi_access, monitor.draws, apart="cluster")
+    with pytest.raises(InputError, match=r"axes to keep apart: .* Did you mean 'cluster'"):
+        window_likelihoods(multi_access, windows(simulate(20, 0)), monitor.draws, apart=("clusters",))
+    markov = DirichletTables(priors(Clusters(CLUSTERS), 0.5, memory=True)).sample(jax.random.key(0), 3)
+    expected = r"draws of 'log_arrival': expected .* \(2, 1, 4\) each, got \(2, 4, 4\) each"
+    with pytest.raises(InputError, match=expected):
+        window_likelihoods(multi_access, windows(simulate(20, 0)), markov)
     few = {"log_arrival": monitor.draws["log_arrival"]}
     with pytest.raises(InputError, match="every latent site of multi_access, got no 'log_reception'"):
         window_likelihoods(multi_access, windows(simulate(20, 0)), few)
+
+
+def test_windows_that_are_not_whole_set_no_threshold_and_raise_no_alarm(learned):
+    """Half of the normal windows are three slots long; of whole ones few alarm all the same."""
+    draws = learned[1].sample(jax.random.key(0), 50)
+    plain = Monitor(multi_access, draws, rate=0.1)
+    short = simulate(3, 15, episodes=60)
+    whole = simulate(10, 16, episodes=60)
+    columns = {
+        f.name: np.concatenate([getattr(log, f.name) for log in (whole, short)]) for f in fields(whole)
+    }
+    columns["episode"][600:] += 60
+    both, alone = windows(NetworkLog(**columns)), windows(whole)
+    found, expected = plain.calibrated(both), plain.calibrated(alone)
+    np.testing.assert_allclose(found.normal, expected.normal, rtol=1e-6)
+    watched = found.watch(both)
+    assert not watched.alarm[60:].any()
+    assert (watched.p_value[60:] == 1.0).all()
+    assert (watched.p_value[:60] < 1.0).any()
+    few = {name: value[55:] if name != "clusters" else value for name, value in both.items()}
+    with pytest.raises(
+        InputError, match=r"whole normal windows for a rate of 0\.1: expected 9 or more, got 5"
+    ):
+        plain.calibrated(few)
+    with pytest.raises(InputError, match="windows to watch: expected 10 readings, as when calibrated, got 3"):
+        found.watch(windows(short))
+
+
+@pytest.mark.study
+def test_a_log_with_gaps_keeps_the_rate_of_alarms(learned):
+    """Calibrated on a log with 5% of its rows missing, watched on a whole one; 6 standard errors of both samples."""
+    draws, random = learned[1].sample(jax.random.key(0), 50), np.random.default_rng(0)
+    log = simulate(8000, 18)
+    kept = random.random(8000) >= 0.05
+    columns = {f.name: getattr(log, f.name)[kept] for f in fields(log)}
+    columns["episode"] = split_gaps(columns["episode"], columns["slot"])
+    monitor = Monitor(multi_access, draws, rate=0.1).calibrated(windows(NetworkLog(**columns)))
+    for seen in (simulate(4000, 19), NetworkLog(**columns)):
+        watched = monitor.watch(windows(seen))
+        error = np.sqrt(0.1 * 0.9 * (1 / len(monitor.normal) + 1 / len(watched.alarm)))
+        assert watched.alarm.mean() < 0.1 + 3 * error
 
 
 def readings(y=None):

@@ -5,11 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from dtprob.control import Stateless, aloha
 from dtprob.errors import InputError
 from dtprob.inference import PointMass
 from dtprob.inference.exact import DirichletTables
 from dtprob.models.dirichlet import log_shares
 from dtprob.models.multi_access import Clusters, kernel, priors, records, window_counts
+from dtprob.twin.counterfactual import Arm, average_effect, what_if
 from dtprob.twin.predict import Prediction, predict
 from dtprob.twin.rollout import overflow, random_access, rollout, throughput
 from tests.small_network import ARRIVAL, CLUSTERS, RECEPTION, simulate
@@ -42,6 +44,28 @@ def test_throughput_of_random_access_is_that_of_the_exact_chain():
     )  # fmt: skip
     assert abs(found.mean - 0.5882) < 4.5 * np.sqrt(found.aleatoric / 20) + 2e-3
     assert found.epistemic == 0.0
+
+
+def test_policies_and_tables_of_another_network_are_refused_and_not_clamped():
+    given = {"metric": throughput, "horizon": 5, "draws": 2, "episodes": 2}
+    law, larger = DirichletTables(priors(Clusters(CLUSTERS), 0.5)), kernel(CLUSTERS, 4)
+    small = Stateless(aloha(4, 1, 0.5))
+    arms = {"baseline": Arm(random_access(4, 0.5)), "alternative": Arm(small)}
+    for ask in (
+        lambda: predict(jax.random.key(0), larger, law, policy=small, **given),
+        lambda: average_effect(jax.random.key(0), larger, law, **arms, **given),
+        lambda: what_if(jax.random.key(0), larger, law, simulate(5, 0), policy=small, draws=2),
+    ):
+        with pytest.raises(InputError, match="capacity of Stateless: expected 4 or more"):
+            ask()
+    with pytest.raises(InputError, match="policy: expected an action of each of 4 devices"):
+        predict(jax.random.key(0), SYSTEM, law, policy=lambda *_: jnp.ones(3, int), **given)
+    other = DirichletTables(priors(Clusters(((0, 1, 2, 3),)), 0.5))
+    expected = r"draws of 'log_arrival': expected .* \(2, 1, 4\) or \(2, 4, 4\) each, got \(1, 1, 16\)"
+    with pytest.raises(InputError, match=expected):
+        predict(jax.random.key(0), SYSTEM, other, policy=random_access(4, 0.5), **given)
+    with pytest.raises(InputError, match="episode: expected a NetworkLog"):
+        what_if(jax.random.key(0), SYSTEM, law, {"buffer": np.zeros((5, 4))}, draws=2)
 
 
 @pytest.mark.study

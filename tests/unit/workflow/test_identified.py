@@ -7,6 +7,7 @@ import numpyro.distributions as dist
 import pytest
 
 from dtprob.inference import Posterior
+from dtprob.models.dirichlet import LogDirichlet
 from dtprob.workflow.identified import contraction
 from dtprob.workflow.summary import summarise
 
@@ -42,6 +43,23 @@ def test_contraction_is_one_minus_the_ratio_of_variances(found):
     assert np.isnan(values["known"][1])  # all draws the same
     assert float(values["idle"]) == pytest.approx(0.0, abs=0.24)
     assert float(values["angle"]) == pytest.approx(0.0, abs=0.24)
+
+
+@pytest.mark.filterwarnings("error")
+def test_an_outcome_that_cannot_happen_has_no_contraction():
+    allowed = np.array([[True, True, False]])
+
+    def table(y=None):
+        level = numpyro.sample("table", LogDirichlet(1.0, allowed))[0, 0]
+        with numpyro.plate("row", 3):
+            numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+    half = np.random.default_rng(0).uniform(size=(1, 4000))
+    draws = np.stack([np.log(half), np.log(1 - half), np.full_like(half, -np.inf)], axis=-1)[:, :, None]
+    posterior = Posterior(draws={"table": draws}, latent=("table",))
+    (found,) = contraction(posterior, table, {"y": jnp.zeros(3)}, ["table"])["table"]
+    np.testing.assert_allclose(found[:2], 0.0, atol=0.5)
+    assert np.isnan(found[2])
 
 
 def test_a_summary_names_what_is_not_identified(found):

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from dtprob.case import load_case
+from dtprob.cli import main
 from dtprob.commands.run import Run, infer
 from dtprob.data import write
 from dtprob.errors import InputError
@@ -47,6 +48,14 @@ def folder(tmp_path_factory):
 def case(folder, engine="laplace", options="window = 10"):
     (folder / "case.toml").write_text(CASE.format(engine=engine, options=options))
     return load_case(folder / "case.toml")
+
+
+def test_a_fit_says_that_it_does_not_learn_from_the_reference(folder, tmp_path, capsys):
+    case(folder, "exact")
+    assert main(["fit", str(folder / "case.toml"), "--out", str(tmp_path)]) == 0
+    told = "".join(capsys.readouterr())
+    assert "fitting after.csv alone: only a diagnosis learns from the reference" in told
+    assert "invalid value" not in told
 
 
 @pytest.mark.study
