@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-from typing import Any, Final, Literal, get_args
+from typing import Any, Final, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import numpyro
 import numpyro.distributions as dist
-from jaxtyping import Array, Complex
+from jaxtyping import Array, Complex, Float, Int
 from numpyro.distributions import constraints, transforms
 
 from dtprob.errors import InputError, check_choice
 from dtprob.models.complex_normal import ComplexNormal
 from dtprob.raytracing import field
 from dtprob.raytracing.beyond import with_all
-from dtprob.raytracing.paths import PathSet
+from dtprob.raytracing.paths import NONE, PathSet
 from dtprob.raytracing.slab import Law
 
 type Materials = Literal["per_material", "per_object", "hierarchical", "shared", "known"]
 """Which permittivities and conductivities are unknown; "hierarchical" gives objects their own, about their class's."""
+
+_METAL: Final = 1e5
+"""A conductivity above this, in S/m, is a metal's: all metals reflect alike, so that it says nothing of other objects."""
+_CONTRAST_SPREAD: Final = 0.4
+"""Standard deviation of the logarithm of a permittivity less one about the scene's."""
+_CONDUCTIVITY_SPREAD: Final = 1.0
+"""Standard deviation of the logarithm of a conductivity about the scene's."""
 
 CHANNEL_AXES = ("link", "snapshot", "rx_antenna", "tx_antenna", "subcarrier")
 AXES = {
@@ -78,6 +85,8 @@ def channel_shape(
 def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, jax.Array]:
     """Permittivity (relative) and conductivity (S/m) of each object, around the scene's own values.
 
+    "shared" lies around the median over the objects that paths hit, metals aside, and is as wide as their values differ.
+
     Raises:
         InputError: `materials` is none of the choices.
     """
@@ -86,28 +95,74 @@ def unknown_materials(paths: PathSet, materials: Materials) -> tuple[jax.Array, 
     if materials == "known":
         return permittivity, conductivity
     if materials == "shared":
-        size, index = 1, jnp.zeros(permittivity.shape[0], int)
+        index, nominal = jnp.zeros(permittivity.shape[0], int), _typical(paths)
     elif materials == "per_object":
-        size, index = permittivity.shape[0], jnp.arange(permittivity.shape[0])
+        index = jnp.arange(permittivity.shape[0])
+        nominal = _of_first(paths, index, permittivity.shape[0])
     else:
-        size, index = len(paths.material_names), paths.object_material
-    first = jax.ops.segment_min(jnp.arange(index.shape[0]), index, size)
-    present = first < index.shape[0]
-    nominal_permittivity = jnp.where(present, permittivity[jnp.where(present, first, 0)], 2.0)
-    nominal_conductivity = jnp.where(present, conductivity[jnp.where(present, first, 0)], 1e-2)
-    contrast = dist.Normal(jnp.log(jnp.maximum(nominal_permittivity - 1.0, 1e-2)), 0.4)
+        index = jnp.asarray(paths.object_material)
+        nominal = _of_first(paths, index, len(paths.material_names))
     above_one = [transforms.ExpTransform(), transforms.AffineTransform(1.0, 1.0, domain=constraints.positive)]
-    with numpyro.plate("material", size):
+    with numpyro.plate("material", nominal.contrast.shape[0]):
         material_permittivity: Any = numpyro.sample(
-            "material_permittivity", dist.TransformedDistribution(contrast, above_one)
+            "material_permittivity",
+            dist.TransformedDistribution(dist.Normal(nominal.contrast, nominal.contrast_spread), above_one),
         )
         material_conductivity: Any = numpyro.sample(
-            "material_conductivity", dist.LogNormal(jnp.log(jnp.maximum(nominal_conductivity, 1e-4)), 1.0)
+            "material_conductivity", dist.LogNormal(nominal.conductivity, nominal.conductivity_spread)
         )
     if materials == "hierarchical":
         contrast = _about("permittivity", material_permittivity[index] - 1.0)
         return 1.0 + contrast, _about("conductivity", material_conductivity[index])
     return material_permittivity[index], material_conductivity[index]
+
+
+class _Nominal(NamedTuple):
+    """Where the priors of materials lie, and how wide they are: logarithms of permittivity less one and conductivity."""
+
+    contrast: Float[Array, " material"]
+    conductivity: Float[Array, " material"]
+    contrast_spread: Float[Array, ""] | float = _CONTRAST_SPREAD
+    conductivity_spread: Float[Array, ""] | float = _CONDUCTIVITY_SPREAD
+
+
+def _logarithms(paths: PathSet) -> tuple[Float[Array, " object"], Float[Array, " object"]]:
+    """Of the scene's permittivity less one and of its conductivity, by object, vacuum's kept finite."""
+    permittivity, conductivity = jnp.asarray(paths.permittivity), jnp.asarray(paths.conductivity)
+    return jnp.log(jnp.maximum(permittivity - 1.0, 1e-2)), jnp.log(jnp.maximum(conductivity, 1e-4))
+
+
+def _of_first(paths: PathSet, index: Int[Array, " object"], size: int) -> _Nominal:
+    """Values of the first object of each material; a material without objects has some."""
+    contrast, conductivity = _logarithms(paths)
+    first = jax.ops.segment_min(jnp.arange(index.shape[0]), index, size)
+    present = first < index.shape[0]
+    place = jnp.where(present, first, 0)
+    return _Nominal(
+        jnp.where(present, contrast[place], 0.0), jnp.where(present, conductivity[place], jnp.log(1e-2))
+    )
+
+
+def _typical(paths: PathSet) -> _Nominal:
+    """The median over the objects that paths hit, metals aside, with the spread of their own values added.
+
+    Where no path hits anything all objects count, and metals count where there is nothing else.
+    """
+    hit = jnp.asarray(paths.mask)[:, :, None] & (jnp.asarray(paths.interaction) != NONE)
+    counts = jnp.zeros(paths.n_object, int).at[jnp.asarray(paths.object)].add(hit.astype(int)) > 0
+    counts = jnp.where(jnp.any(counts), counts, True)
+    dielectric = counts & (jnp.asarray(paths.conductivity) <= _METAL)
+    counts = jnp.where(jnp.any(dielectric), dielectric, counts)
+
+    def told(values: Float[Array, " object"], spread: float) -> tuple[Array, Array]:
+        centre = jnp.nanmedian(jnp.where(counts, values, jnp.nan))
+        off = jnp.sum(jnp.where(counts, (values - centre) ** 2, 0.0)) / jnp.sum(counts)
+        return centre[None], jnp.sqrt(spread**2 + off)
+
+    contrast, conductivity = _logarithms(paths)
+    centre, width = told(contrast, _CONTRAST_SPREAD)
+    other, wide = told(conductivity, _CONDUCTIVITY_SPREAD)
+    return _Nominal(centre, other, width, wide)
 
 
 def _about(name: str, centre: jax.Array) -> jax.Array:
