@@ -11,6 +11,7 @@ from jaxtyping import Float, Int
 from dtprob.errors import InputError, unknown_name
 from dtprob.raytracing.assemble import Antenna, Flat, assemble
 from dtprob.raytracing.candidates import in_groups
+from dtprob.raytracing.carrier import carrier_of, set_frequency
 from dtprob.raytracing.inside import enclosing_objects
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.sionna import sionna_rt
@@ -25,7 +26,8 @@ def load_scene(
 ) -> Any:
     """Load a scene and fix its materials at a carrier.
 
-    The materials take their values at this frequency and keep them, whatever is edited later.
+    The materials take their values at this frequency and keep them, whatever is edited later;
+    `dtprob.raytracing.carrier.set_frequency` takes them to another.
 
     Args:
         file: name of a scene that sionna-rt ships, or path of a Mitsuba XML file.
@@ -47,36 +49,6 @@ def load_scene(
         got = f"an error of the loader: {error}"
         raise InputError(f"scene {path}", "a Mitsuba XML scene", got, "Correct the file") from error
     return set_frequency(scene, frequency)
-
-
-def set_frequency(scene: Any, frequency: float) -> Any:
-    """Set the carrier of a scene, then fix its materials at their values there.
-
-    Args:
-        scene: a ``sionna.rt.Scene``, changed in place and given back.
-        frequency: carrier in Hz.
-
-    Raises:
-        InputError: the frequency is not positive, or a material is not known there.
-    """
-    if not frequency > 0:
-        raise InputError(
-            "frequency of the scene", "a positive carrier in Hz", repr(frequency), "Give it in Hz"
-        )
-    try:
-        scene.frequency = frequency
-    except ValueError as error:
-        raise unknown_materials(frequency, error) from error
-    for material in scene.radio_materials.values():
-        if hasattr(material, "frequency_update_callback"):
-            material.frequency_update_callback = None
-    return scene
-
-
-def unknown_materials(frequency: float, error: ValueError) -> InputError:
-    """What to raise for the solver's refusal of a material at a carrier in Hz."""
-    expected = f"materials that are known at {frequency / 1e9:g} GHz"
-    return InputError("scene", expected, f"'{error}'", "Choose another carrier or other materials")
 
 
 def _scene_file(file: str | os.PathLike[str], shipped: dict[str, Path]) -> Path:
@@ -146,8 +118,8 @@ def trace(
         allow_empty: whether a link may have no path.
 
     Raises:
-        InputError: a link without a path, an end inside a wall, wrong positions, an unknown pattern, or an
-            unsupported interaction.
+        InputError: a link without a path, an end inside a wall, wrong positions, an unknown pattern, an unsupported
+            interaction, or a scene whose carrier was changed after its materials were fixed.
     """
     tx, rx = _positions("tx_position", tx_position), _positions("rx_position", rx_position)
     _check_request(tx, rx, max_depth, samples, diffraction=diffraction, diffuse_reflection=diffuse_reflection)
@@ -222,7 +194,7 @@ def _positions(name: str, value: Float[np.ndarray, "link 3"]) -> Float[np.ndarra
 
 
 def _carrier(scene: Any, frequency: float | None) -> float:
-    held = float(np.asarray(scene.frequency).reshape(-1)[0])
+    held = carrier_of(scene)
     if frequency is not None and abs(frequency - held) > 1e-6 * held:
         raise InputError(
             "frequency", f"that of the scene, {held:.6g} Hz", f"{frequency:.6g} Hz", "Load the scene at it"
