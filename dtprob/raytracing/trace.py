@@ -1,21 +1,28 @@
 """Trace the paths of many links through a scene, once, into a `PathSet`."""
 
 import os
+import warnings
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.constants import speed_of_light
 
 from dtprob.errors import InputError, unknown_name
-from dtprob.raytracing.assemble import Antenna, Flat, assemble
+from dtprob.raytracing.assemble import SAME, Antenna, Flat, assemble
 from dtprob.raytracing.candidates import in_groups
 from dtprob.raytracing.carrier import carrier_of, set_frequency
 from dtprob.raytracing.inside import enclosing_objects
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.sionna import sionna_rt
 from dtprob.raytracing.solve import Settings, Traced, describe_objects, solve
+
+_ROUNDING: Final = 2.0**-24
+"""Largest relative error of a coordinate in the solver, whose meshes and rays are of single precision."""
+_HOPELESS: Final = 1e-3
+"""Coordinates of both ends that are rounded by more than this, in m, lose most reflections and double others."""
 
 
 def load_scene(
@@ -95,7 +102,8 @@ def trace(
     """Find the paths of each link and recompute their geometry in double precision.
 
     Antennas have one element; arrays enter later, through `field.steering`. Only the pairs asked for are
-    traced, and which paths are found does not depend on antennas. Warns where the solver dropped candidates of a link.
+    traced, and which paths are found does not depend on antennas. Warns where the solver dropped candidates of a link,
+    and where ends are so far from the origin (a kilometre or two) that it rounds them too much.
 
     Args:
         scene: from `load_scene` or `floorplan_scene`; left as it was.
@@ -119,11 +127,12 @@ def trace(
 
     Raises:
         InputError: a link without a path, an end inside a wall, wrong positions, an unknown pattern, an unsupported
-            interaction, or a scene whose carrier was changed after its materials were fixed.
+            interaction, a scene whose carrier was changed after its materials were fixed, or one 17 km from the origin.
     """
     tx, rx = _positions("tx_position", tx_position), _positions("rx_position", rx_position)
     _check_request(tx, rx, max_depth, samples, diffraction=diffraction, diffuse_reflection=diffuse_reflection)
     carrier = _carrier(scene, frequency)
+    _check_near(tx, rx, speed_of_light / carrier)
     settings = Settings(max_depth, refraction, samples, seed, max_paths)
     sending = Antenna(tx_pattern, polarization, tx_orientation).checked(len(tx))
     other = polarization if rx_polarization is None else rx_polarization
@@ -193,6 +202,21 @@ def _positions(name: str, value: Float[np.ndarray, "link 3"]) -> Float[np.ndarra
     return array
 
 
+def _check_near(tx: Float[np.ndarray, "link 3"], rx: Float[np.ndarray, "link 3"], wavelength: float) -> None:
+    """Refuse links far from the origin at both ends; warn of ends whose rounding doubles paths or turns phases."""
+    size = np.max(np.abs([tx, rx]), axis=2)
+    if np.any(np.min(size, axis=0) * _ROUNDING > _HOPELESS):
+        got = f"{size.max() / 1e3:.3g} km"
+        remedy = "Move the scene and the ends of its links to the origin"
+        expected = f"ends within {_HOPELESS / _ROUNDING / 1e3:.2g} km of the scene's origin"
+        raise InputError("positions of the links", expected, got, remedy)
+    rounded = float(size.max()) * _ROUNDING
+    if rounded > min(SAME, wavelength / 100):
+        place = f"{size.max() / 1e3:.3g} km from the origin"
+        text = f"the solver rounds places {place} to {1e3 * rounded:.2g} mm, so that paths may be lost or doubled"
+        warnings.warn(f"{text}; move the scene to the origin.", RuntimeWarning, stacklevel=3)
+
+
 def _carrier(scene: Any, frequency: float | None) -> float:
     held = carrier_of(scene)
     if frequency is not None and abs(frequency - held) > 1e-6 * held:
@@ -220,6 +244,9 @@ def _check_request(
         raise InputError(
             "links", "ends at least 1 cm apart", f"links {same} with both ends at one place", "Move one end"
         )
+    for name, value in (("max_depth", max_depth), ("samples", samples)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise InputError(name, "a whole number", repr(value), "Give it without a point")
     if max_depth < 0 or samples < 1:
         got = f"max_depth {max_depth}, samples {samples}"
         raise InputError("trace", "max_depth of 0 or more and samples of 1 or more", got, "Correct them")

@@ -242,6 +242,7 @@ REFUSED = {
     "polarization": ({"polarization": "VH"}, "polarization of a single element"),
     "orientation": ({"rx_orientation": np.zeros((2, 3))}, r"three for each of 1 links, got shape \(2, 3\)"),
     "depth": ({"max_depth": -1}, "max_depth of 0 or more"),
+    "real depth": ({"max_depth": 2.0}, "max_depth: expected a whole number, got 2.0"),
     "carrier": ({"frequency": 3e9}, r"2.8e\+10 Hz, got 3e\+09 Hz"),
 }
 
