@@ -14,7 +14,7 @@ from scipy import special
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.prediction_powered.arrays import Values, namespace
 from dtprob.models.prediction_powered.covariance import inverse_hessian, spread
-from dtprob.models.prediction_powered.losses import AbstractLoss, named_loss
+from dtprob.models.prediction_powered.losses import LOSSES, AbstractLoss, named_loss
 from dtprob.models.prediction_powered.moments import Evaluation, evaluate
 from dtprob.models.prediction_powered.quantile import Quantile, estimate_quantile
 from dtprob.models.prediction_powered.result import Estimate
@@ -63,7 +63,9 @@ def estimate(
     if isinstance(loss, Quantile):
         result = estimate_quantile(loss, sample, chosen, level=level, practice=practice)
     else:
-        result = _estimate(_problem(named_loss(loss), sample, chosen, practice), by, level)
+        known = named_loss(loss)
+        check_labels(known, sample.y)
+        result = _estimate(_problem(known, sample, chosen, practice), by, level)
     return replace(result, notes=notes)
 
 
@@ -113,6 +115,25 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         n=sample.n,
         n_unlabelled=sample.n_unlabelled if sample.has_predictions else 0,
     )
+
+
+def check_labels(loss: AbstractLoss, y: np.ndarray) -> None:
+    """Refuse labels outside of what a named loss is made for, such as classes -1 and 1 of a logistic regression.
+
+    Args:
+        loss: any.
+        y: labels, (n,) or (n, label).
+
+    Raises:
+        InputError: a label that the loss does not allow, with the names of other losses.
+    """
+    name = next((name for name, one in LOSSES.items() if one is loss), "")
+    allowed = {"logistic": (y >= 0) & (y <= 1), "poisson": y >= 0}.get(name, np.ones(y.shape, bool))
+    if not allowed.all():
+        wrong = float(y[~allowed][0])
+        expected = "labels 0 and 1" if name == "logistic" else "labels from 0 up"
+        others = ", ".join(other for other in LOSSES if other != name)
+        raise InputError(f"y with loss {name}", expected, f"{wrong:g}", f"Correct y, or use {others}")
 
 
 def _check_contexts(by: By, loss: str | AbstractLoss | Quantile, sample: Sample, practice: Practice) -> None:
