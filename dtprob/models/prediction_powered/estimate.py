@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, final, get_args
 
@@ -13,8 +14,8 @@ from scipy import special
 
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.prediction_powered.arrays import Values, namespace
-from dtprob.models.prediction_powered.covariance import inverse_hessian, spread
-from dtprob.models.prediction_powered.losses import LOSSES, AbstractLoss, named_loss
+from dtprob.models.prediction_powered.covariance import effective_number, inverse_hessian, spread
+from dtprob.models.prediction_powered.losses import LOSSES, AbstractLoss, SmoothQuantile, named_loss
 from dtprob.models.prediction_powered.moments import Evaluation, evaluate
 from dtprob.models.prediction_powered.quantile import Quantile, estimate_quantile
 from dtprob.models.prediction_powered.result import Estimate
@@ -25,6 +26,12 @@ from dtprob.models.prediction_powered.tuning import CAREFUL, By, Lambda, Practic
 
 NO_UNLABELLED: Final = "There are no unlabelled samples with predictions, so this is plain ERM."
 BIASED: Final = "The interval does not cover the bias of the predictor."
+_FEWEST_PER_CONTEXT: Final = 20
+"""Labels of a context below which its lambda is hardly known."""
+_FEWEST_BEYOND: Final = 5
+"""Labels expected beyond a quantile below which its normal approximation is poor."""
+_FEWEST_EFFECTIVE: Final = 30
+"""Effective labels below which intervals are not right to first order."""
 
 
 def estimate(
@@ -66,7 +73,31 @@ def estimate(
         known = named_loss(loss)
         check_labels(known, sample.y)
         result = _estimate(_problem(known, sample, chosen, practice), by, level)
-    return replace(result, notes=notes)
+    return replace(result, notes=(*notes, *_few(loss, sample, chosen, by)))
+
+
+def _few(loss: str | AbstractLoss | Quantile, sample: Sample, scheme: Scheme, by: By) -> Iterator[str]:
+    """Where so few labels tell the variance, a quantile or a lambda that the interval may be too narrow."""
+    number = float(effective_number(sample.labelled_weight))
+    if isinstance(loss, Quantile | SmoothQuantile):
+        beyond = number * min(loss.level, 1 - loss.level)
+        if beyond < _FEWEST_BEYOND:
+            yield (
+                f"Only {beyond:.1f} labels are expected beyond the quantile {loss.level:g}, so that the interval may be "
+                f"too narrow. Give more labels, or ask for a quantile nearer to the median."
+            )
+    if sample.weight is not None and number < _FEWEST_EFFECTIVE:
+        yield (
+            f"The weights leave {number:.0f} effective labels of {sample.n}, so that the interval may be too narrow."
+        )
+    if by == "context" and scheme.is_tuned:
+        poor = np.flatnonzero(np.bincount(sample.labelled_context) < _FEWEST_PER_CONTEXT)
+        if len(poor):
+            shown = ", ".join(map(str, poor[:10])) + (", ..." if len(poor) > 10 else "")
+            yield (
+                f"Fewer than {_FEWEST_PER_CONTEXT} labels in contexts {shown}, so that the interval may be too narrow. "
+                "Join contexts, or tune overall."
+            )
 
 
 def _checked(scheme: Scheme, lam: float | None, level: float) -> Scheme:
@@ -94,7 +125,7 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         theta = problem.solve(lam, theta, evaluation)
         evaluation = problem.at(theta)
         inverse = inverse if problem.is_translation else problem.inverse(evaluation, lam)
-    found = spread(evaluation, problem.mixes(lam.value), inverse, practice)
+    found = spread(evaluation, problem.mixes(lam.value), inverse, practice, problem.tuned(by))
     alone = spread(evaluation, problem.labels_alone(lam), inverse, practice)
     covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
     chance = (1 + level) / 2
@@ -200,6 +231,11 @@ class _Problem:
         """Whether theta only shifts the gradients, so that one evaluation tells all."""
         weighted = self.sample.weight is not None or self.sample.weight_unlabelled is not None
         return self.loss.traits.translation and not weighted
+
+    def tuned(self, by: By) -> int:
+        """Degrees of freedom that the tuned lambdas cost: one for each beyond the first, none where `lost` is given."""
+        counts = by == "context" and self.rounds > 0 and self.practice.lost is None
+        return self.sample.n_context - 1 if counts else 0
 
     def at(self, theta: Float[Values, " parameter"]) -> Evaluation:
         return self.start if self.is_translation else evaluate(self.loss, self.sample, theta)
