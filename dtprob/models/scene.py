@@ -6,8 +6,10 @@ from typing import Any, Final, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
+from jax.core import Tracer
 from jaxtyping import Array, Complex, Float, Int
 from numpyro.distributions import constraints, transforms
 
@@ -212,7 +214,17 @@ def array_response(array: jax.Array | None, direction: jax.Array, frequency: flo
 
 
 def unknown_noise_power(noise_power: Any, paths: PathSet) -> jax.Array:
-    """Variance of the noise, broadcastable to the channel: around the given level, or a very vague one."""
+    """Variance of the noise, broadcastable to the channel: around the given level, or a very vague one.
+
+    Args:
+        noise_power: E |noise|^2 per entry, a number or one per link; None where it is not known.
+        paths: of the links.
+
+    Raises:
+        InputError: another shape, or a known level that is not positive.
+    """
+    if noise_power is not None:
+        _check_noise(noise_power, paths.n_link)
     if noise_power is None:
         free_space = jnp.where(paths.mask, (paths.wavelength / (4 * jnp.pi * paths.length)) ** 2, 0.0)
         reference, spread = 1e-2 * jnp.mean(jnp.sum(free_space, axis=1)), 3.5
@@ -221,6 +233,17 @@ def unknown_noise_power(noise_power: Any, paths: PathSet) -> jax.Array:
     level: Any = numpyro.sample("noise_level", dist.LogNormal(0.0, spread))
     reference = jnp.broadcast_to(reference, (paths.delay.shape[0],)) if jnp.ndim(reference) else reference
     return (level * reference).reshape((-1, 1, 1, 1, 1))
+
+
+def _check_noise(noise_power: Any, n_link: int) -> None:
+    expected, remedy = (
+        f"positive values, one or one for each of {n_link} links",
+        "Give the variance of the noise",
+    )
+    if jnp.shape(noise_power) not in {(), (1,), (n_link,)}:
+        raise InputError("noise_power", expected, f"shape {jnp.shape(noise_power)}", remedy)
+    if not isinstance(noise_power, Tracer) and not np.all(np.asarray(noise_power) > 0):
+        raise InputError("noise_power", expected, f"{np.min(np.asarray(noise_power)):g}", remedy)
 
 
 def observe(

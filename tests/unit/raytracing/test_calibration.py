@@ -267,6 +267,11 @@ def test_bad_input_is_named(paths, array):
         ({"tx_array": None}, "tx_antenna: expected the 1 of tx_array, got 9"),
         ({"paths": paths.take([0])}, "link: expected the 1 of the path set"),
         ({"channel": h[0]}, "all five"),
+        (
+            {"subcarrier_frequency": TONES + 3.5e9},
+            "Hz from the carrier, 3.5e.09 Hz, got .* Subtract the carrier",
+        ),
+        ({"subcarrier_frequency": TONES / 1e9}, "different frequencies, got 16 within 0.3 Hz"),
     ):
         right = {"paths": paths, "subcarrier_frequency": TONES, "channel": h}
         with pytest.raises(InputError, match=source):
