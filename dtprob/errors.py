@@ -86,9 +86,12 @@ def check_choice(what: str, value: object, choices: Iterable[str]) -> None:
 
 
 def _plural(kind: str) -> str:
-    """Several of what ``kind`` names: ``keys``, ``effect families``, ``kinds of traffic``."""
+    """Several of what ``kind`` names: ``keys``, ``losses``, ``effect families``, ``kinds of traffic``."""
     noun, of, rest = kind.partition(" of ")
-    several = f"{noun[:-1]}ies" if noun.endswith("y") and noun[-2:-1] not in "aeiou" else f"{noun}s"
+    if noun.endswith("y") and noun[-2:-1] not in "aeiou":
+        several = f"{noun[:-1]}ies"
+    else:
+        several = f"{noun}es" if noun.endswith("s") else f"{noun}s"
     return f"{several}{of}{rest}"
 
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from dtprob.case import Case
 from dtprob.commands.run import Run, chosen, infer, prepare_case, session
 from dtprob.files import write_text
-from dtprob.workflow.identified import contraction
+from dtprob.workflow.identified import learnt
 from dtprob.workflow.summary import entry_names, summarise, summarised
 
 
@@ -29,7 +29,7 @@ def run(case: Case, out: Path, *, engine: str | None, seed: int | None, no_code:
         posterior = infer(prepared, prepared.data, out / "posterior.nc", job)
         if "reason" in posterior.provenance:
             say(f"{posterior.provenance['chosen']} was chosen: {posterior.provenance['reason']}")
-        known = contraction(posterior, prepared.model, prepared.data, summarised(posterior))
+        known = learnt(posterior, prepared.model, prepared.data, summarised(posterior))
         summary = summarise(posterior, known)
         summary["provenance"] |= prepared.provenance
         if names := entry_names(prepared.data):

@@ -12,6 +12,7 @@ from jaxtyping import Bool, Complex, Float, Int
 
 from dtprob.data.arrays import ArraySpec, check_arrays, check_finite
 from dtprob.data.network_rows import check_rows
+from dtprob.data.tones import check_tones
 from dtprob.errors import InputError
 
 _POSITIONS = {
@@ -104,7 +105,7 @@ class ChannelData(_OfLinks):
 
     Raises:
         InputError: arrays that do not fit together, NaN or infinity, a noise power that is not positive, subcarriers all at
-            one frequency.
+            one frequency or within 1 Hz (frequencies in GHz).
     """
 
     channel: Complex[np.ndarray, "link snapshot rx_antenna tx_antenna subcarrier"]
@@ -119,11 +120,7 @@ class ChannelData(_OfLinks):
 
     def __post_init__(self) -> None:
         self._check(CHANNEL_ARRAYS)
-        frequency = self.subcarrier_frequency
-        if len(frequency) > 1 and np.ptp(frequency) == 0:
-            got = f"{frequency[0]:g} Hz for all {len(frequency)}"
-            remedy = "Give each subcarrier's own frequency, in Hz from the carrier"
-            raise InputError("subcarrier_frequency", "different frequencies", got, remedy)
+        check_tones(self.subcarrier_frequency)
         _check_array(self.rx_array, "rx_array", self.channel.shape[2])
         _check_array(self.tx_array, "tx_array", self.channel.shape[3])
 

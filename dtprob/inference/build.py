@@ -32,7 +32,7 @@ def build_target(model: Model, data: Data) -> tuple[Target, Inputs]:
 
     Raises:
         InputError: the data do not fit the model; or the model has a discrete or complex latent site, a
-            parameter site, a plate that subsamples, an obs_mask, or nothing latent.
+            parameter site, a plate that subsamples, an obs_mask, or nothing latent; or NaN in the data reach its density.
     """
     warn_of_miscompilation()
     arrays, static = split_static(data)
@@ -40,7 +40,39 @@ def build_target(model: Model, data: Data) -> tuple[Target, Inputs]:
     target = _TARGETS.get(model, arrays, static)
     bare = Inputs(arrays, jnp.zeros(target.dimension), jnp.ones(target.dimension))
     draws = target.once(Target.prior_draws)(jax.random.key(0), bare, {})
-    return target, Inputs(arrays, *prior_units(target, np.asarray(draws)))
+    inputs = Inputs(arrays, *prior_units(target, np.asarray(draws)))
+    _refuse_nan(target, inputs)
+    return target, inputs
+
+
+def _refuse_nan(target: Target, inputs: Inputs) -> None:
+    """Name an argument whose NaN leaves no density where finite numbers would; what a model masks may stay."""
+    holes = {name: place for name, entry in inputs.arrays.items() if (place := _hole(entry)) is not None}
+    if not holes:
+        return
+    filled = inputs._replace(arrays=jax.tree.map(_filled, inputs.arrays))
+    density = target.once(Target.log_density)
+    as_given, as_filled = (density(jnp.zeros(target.dimension), each) for each in (inputs, filled))
+    if np.isfinite(as_filled) and not np.isfinite(as_given):
+        name, place = next(iter(holes.items()))
+        remedy = "Leave the reading out, or mask it with a finite number in its place"
+        raise InputError(f"data {name!r}", "finite numbers", f"NaN at index {place}", remedy)
+
+
+def _hole(entry: Any) -> list[int] | None:
+    """Where an argument's first NaN is, if it has one."""
+    for leaf in jax.tree.leaves(entry):
+        if jnp.issubdtype(leaf.dtype, jnp.inexact) and bool(jnp.isnan(leaf).any()):
+            return np.argwhere(np.isnan(leaf))[0].tolist()
+    return None
+
+
+def _filled(leaf: Array) -> Array:
+    """An array with one of its own finite values in place of each NaN."""
+    if not jnp.issubdtype(leaf.dtype, jnp.inexact) or not bool(jnp.isnan(leaf).any()):
+        return leaf
+    there = np.asarray(leaf)[~np.isnan(leaf)]
+    return jnp.where(jnp.isnan(leaf), there[0] if len(there) else 1.0, leaf)
 
 
 def prior_units(target: Target, draws: np.ndarray) -> tuple[Array, Array]:

@@ -72,7 +72,9 @@ def _rows(posterior: Posterior, name: str, probability: float) -> Iterable[tuple
 
 def _linear(entry: np.ndarray, probability: float) -> list[object]:
     low, high = np.quantile(entry, [0.5 - probability / 2, 0.5 + probability / 2])
-    return ["linear", entry.mean(), entry.std(), low, high, np.nan, *_quality([entry])]
+    with np.errstate(invalid="ignore"):  # of draws that are not finite
+        mean, spread = entry.mean(), entry.std()
+    return ["linear", mean, spread, low, high, np.nan, *_quality([entry])]
 
 
 def _circular(entry: np.ndarray, probability: float) -> list[object]:

@@ -15,7 +15,7 @@ from dtprob.raytracing.paths import NONE, PathSet, validate
 from dtprob.raytracing.pattern import PATTERNS, field_vector, slant_angle
 from dtprob.raytracing.solve import Objects, Settings
 
-_SAME: Final = 1e-4
+SAME: Final = 1e-4
 """Two paths by way of the same objects whose unfolded ends lie closer than this, in m, are one."""
 
 
@@ -203,7 +203,7 @@ def _repeated(
     bounds = np.flatnonzero(np.diff(flat.link)) + 1
     for rows in np.split(np.arange(len(flat.link)), bounds):
         same = np.all(steps[rows, None] == steps[None, rows], axis=-1)
-        same &= np.linalg.norm(unfolded[rows, None] - unfolded[None, rows], axis=-1) < _SAME
+        same &= np.linalg.norm(unfolded[rows, None] - unfolded[None, rows], axis=-1) < SAME
         again[rows] = np.any(np.tril(same, -1), axis=1)
     return again
 

@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from dtprob.errors import InputError, unknown_name
+from dtprob.raytracing.carrier import set_frequency, unknown_materials
 from dtprob.raytracing.sionna import sionna_rt
-from dtprob.raytracing.trace import set_frequency, unknown_materials
 
 _GAP: Final = 1e-3
 """Height in m at which furniture starts, so that it shares no plane with the floor."""

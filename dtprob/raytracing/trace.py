@@ -1,20 +1,28 @@
 """Trace the paths of many links through a scene, once, into a `PathSet`."""
 
 import os
+import warnings
 from pathlib import Path
 from types import ModuleType
-from typing import Any
+from typing import Any, Final
 
 import numpy as np
 from jaxtyping import Float, Int
+from scipy.constants import speed_of_light
 
 from dtprob.errors import InputError, unknown_name
-from dtprob.raytracing.assemble import Antenna, Flat, assemble
+from dtprob.raytracing.assemble import SAME, Antenna, Flat, assemble
 from dtprob.raytracing.candidates import in_groups
+from dtprob.raytracing.carrier import carrier_of, set_frequency
 from dtprob.raytracing.inside import enclosing_objects
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.sionna import sionna_rt
 from dtprob.raytracing.solve import Settings, Traced, describe_objects, solve
+
+_ROUNDING: Final = 2.0**-24
+"""Largest relative error of a coordinate in the solver, whose meshes and rays are of single precision."""
+_HOPELESS: Final = 1e-3
+"""Coordinates of both ends that are rounded by more than this, in m, lose most reflections and double others."""
 
 
 def load_scene(
@@ -25,7 +33,8 @@ def load_scene(
 ) -> Any:
     """Load a scene and fix its materials at a carrier.
 
-    The materials take their values at this frequency and keep them, whatever is edited later.
+    The materials take their values at this frequency and keep them, whatever is edited later;
+    `dtprob.raytracing.carrier.set_frequency` takes them to another.
 
     Args:
         file: name of a scene that sionna-rt ships, or path of a Mitsuba XML file.
@@ -47,36 +56,6 @@ def load_scene(
         got = f"an error of the loader: {error}"
         raise InputError(f"scene {path}", "a Mitsuba XML scene", got, "Correct the file") from error
     return set_frequency(scene, frequency)
-
-
-def set_frequency(scene: Any, frequency: float) -> Any:
-    """Set the carrier of a scene, then fix its materials at their values there.
-
-    Args:
-        scene: a ``sionna.rt.Scene``, changed in place and given back.
-        frequency: carrier in Hz.
-
-    Raises:
-        InputError: the frequency is not positive, or a material is not known there.
-    """
-    if not frequency > 0:
-        raise InputError(
-            "frequency of the scene", "a positive carrier in Hz", repr(frequency), "Give it in Hz"
-        )
-    try:
-        scene.frequency = frequency
-    except ValueError as error:
-        raise unknown_materials(frequency, error) from error
-    for material in scene.radio_materials.values():
-        if hasattr(material, "frequency_update_callback"):
-            material.frequency_update_callback = None
-    return scene
-
-
-def unknown_materials(frequency: float, error: ValueError) -> InputError:
-    """What to raise for the solver's refusal of a material at a carrier in Hz."""
-    expected = f"materials that are known at {frequency / 1e9:g} GHz"
-    return InputError("scene", expected, f"'{error}'", "Choose another carrier or other materials")
 
 
 def _scene_file(file: str | os.PathLike[str], shipped: dict[str, Path]) -> Path:
@@ -123,7 +102,8 @@ def trace(
     """Find the paths of each link and recompute their geometry in double precision.
 
     Antennas have one element; arrays enter later, through `field.steering`. Only the pairs asked for are
-    traced, and which paths are found does not depend on antennas. Warns where the solver dropped candidates of a link.
+    traced, and which paths are found does not depend on antennas. Warns where the solver dropped candidates of a link,
+    and where ends are so far from the origin (a kilometre or two) that it rounds them too much.
 
     Args:
         scene: from `load_scene` or `floorplan_scene`; left as it was.
@@ -146,12 +126,13 @@ def trace(
         allow_empty: whether a link may have no path.
 
     Raises:
-        InputError: a link without a path, an end inside a wall, wrong positions, an unknown pattern, or an
-            unsupported interaction.
+        InputError: a link without a path, an end inside a wall, wrong positions, an unknown pattern, an unsupported
+            interaction, a scene whose carrier was changed after its materials were fixed, or one 17 km from the origin.
     """
     tx, rx = _positions("tx_position", tx_position), _positions("rx_position", rx_position)
     _check_request(tx, rx, max_depth, samples, diffraction=diffraction, diffuse_reflection=diffuse_reflection)
     carrier = _carrier(scene, frequency)
+    _check_near(tx, rx, speed_of_light / carrier)
     settings = Settings(max_depth, refraction, samples, seed, max_paths)
     sending = Antenna(tx_pattern, polarization, tx_orientation).checked(len(tx))
     other = polarization if rx_polarization is None else rx_polarization
@@ -221,8 +202,23 @@ def _positions(name: str, value: Float[np.ndarray, "link 3"]) -> Float[np.ndarra
     return array
 
 
+def _check_near(tx: Float[np.ndarray, "link 3"], rx: Float[np.ndarray, "link 3"], wavelength: float) -> None:
+    """Refuse links far from the origin at both ends; warn of ends whose rounding doubles paths or turns phases."""
+    size = np.max(np.abs([tx, rx]), axis=2)
+    if np.any(np.min(size, axis=0) * _ROUNDING > _HOPELESS):
+        got = f"{size.max() / 1e3:.3g} km"
+        remedy = "Move the scene and the ends of its links to the origin"
+        expected = f"ends within {_HOPELESS / _ROUNDING / 1e3:.2g} km of the scene's origin"
+        raise InputError("positions of the links", expected, got, remedy)
+    rounded = float(size.max()) * _ROUNDING
+    if rounded > min(SAME, wavelength / 100):
+        place = f"{size.max() / 1e3:.3g} km from the origin"
+        text = f"the solver rounds places {place} to {1e3 * rounded:.2g} mm, so that paths may be lost or doubled"
+        warnings.warn(f"{text}; move the scene to the origin.", RuntimeWarning, stacklevel=3)
+
+
 def _carrier(scene: Any, frequency: float | None) -> float:
-    held = float(np.asarray(scene.frequency).reshape(-1)[0])
+    held = carrier_of(scene)
     if frequency is not None and abs(frequency - held) > 1e-6 * held:
         raise InputError(
             "frequency", f"that of the scene, {held:.6g} Hz", f"{frequency:.6g} Hz", "Load the scene at it"
@@ -248,6 +244,9 @@ def _check_request(
         raise InputError(
             "links", "ends at least 1 cm apart", f"links {same} with both ends at one place", "Move one end"
         )
+    for name, value in (("max_depth", max_depth), ("samples", samples)):
+        if isinstance(value, bool) or not isinstance(value, (int, np.integer)):
+            raise InputError(name, "a whole number", repr(value), "Give it without a point")
     if max_depth < 0 or samples < 1:
         got = f"max_depth {max_depth}, samples {samples}"
         raise InputError("trace", "max_depth of 0 or more and samples of 1 or more", got, "Correct them")

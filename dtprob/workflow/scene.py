@@ -16,6 +16,7 @@ from jaxtyping import Float
 from dtprob.case import Case, SceneSection
 from dtprob.data import ChannelData, PowerData
 from dtprob.data.location import located
+from dtprob.data.tones import check_tones
 from dtprob.edition import edition
 from dtprob.effects.mistaken import place_name
 from dtprob.effects.solver import DEPTH, REFRACTION
@@ -96,10 +97,11 @@ def paths_of(
         _check_needs_no_trace(scene, case)
         paths = _same_links(storage.load(scene.file), _placed(scene, data), case)
         _check_traced(scene, paths, case, say)
-        _check_tones(paths.frequency, data)
+        if isinstance(data, ChannelData):
+            check_tones(data.subcarrier_frequency, paths.frequency)
         return paths
-    if scene.frequency is not None:
-        _check_tones(scene.frequency, data)
+    if scene.frequency is not None and isinstance(data, ChannelData):
+        check_tones(data.subcarrier_frequency, scene.frequency)
     kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
     if kept is not None and kept.is_file():
         say(f"taking the paths that were traced before, {kept.name}")
@@ -263,15 +265,6 @@ def _named(file: Path) -> set[str]:
         return set()  # the ray tracer says what is wrong
     values = [e.get("value") for e in elements if e.get("name") == "filename"]
     return {name for name in (*values, *(e.get("filename") for e in elements)) if name}
-
-
-def _check_tones(carrier: float, data: ChannelData | PowerData) -> None:
-    """Refuse frequencies that count from zero where they are to count from the carrier."""
-    if isinstance(data, ChannelData) and data.subcarrier_frequency.min() > carrier / 2:
-        got = f"{data.subcarrier_frequency.min():g} Hz and more"
-        raise InputError(
-            "subcarrier_frequency", f"Hz from the carrier, {carrier:g} Hz", got, "Subtract the carrier"
-        )
 
 
 def _same_links(paths: PathSet, data: ChannelData | PowerData, case: Case) -> PathSet:

@@ -53,7 +53,11 @@ def _inverse(evaluation: Evaluation, mix: Mix, *, pooled: bool) -> Values:
 
 @compiled_for_jax
 def spread(
-    evaluation: Evaluation, mix: Mix, inverse: Float[Values, "parameter parameter"], practice: Practice
+    evaluation: Evaluation,
+    mix: Mix,
+    inverse: Float[Values, "parameter parameter"],
+    practice: Practice,
+    tuned: int = 0,
 ) -> Spread:
     """The sandwich covariance of an estimate.
 
@@ -62,6 +66,7 @@ def spread(
         mix: the weights of the corrected loss; the last two entries per parameter and context.
         inverse: inverse of the mean second derivative.
         practice: conventions.
+        tuned: degrees of freedom lost beside those of the parameters, to lambdas that were tuned on the labels.
     """
     xp = namespace(evaluation.gradient)
     n, count, d = evaluation.n, evaluation.n_unlabelled, len(inverse)
@@ -70,8 +75,9 @@ def spread(
     predicted = inside.astype(inverse.dtype) @ mix.predicted.T * (evaluation.predicted_gradient @ inverse)
     influence = mix.true * (evaluation.gradient @ inverse) - predicted
     influence = centred(influence, evaluation.weight)
-    labelled_degrees = xp.maximum(n - lost, 1.0)
-    labelled = influence.T @ influence / labelled_degrees / n
+    effective = n if evaluation.weight is None else effective_number(evaluation.weight)
+    labelled_degrees = xp.maximum(effective - lost - tuned, 1.0)
+    labelled = influence.T @ influence * (effective / labelled_degrees) / n**2
     untold = (n <= lost) & xp.eye(
         d, dtype=bool
     )  # a fit to as many labels as parameters leaves no error to look at
@@ -84,6 +90,11 @@ def spread(
     whole = variances[0] + variances[1]
     degrees = xp.where(xp.isfinite(whole), whole**2 / xp.maximum(total, tiny), 1.0)
     return Spread(labelled + unlabelled, xp.maximum(degrees, 1.0))
+
+
+def effective_number(weight: Float[Values, " sample"]) -> Float[Values, ""]:
+    """How many samples of one weight say as much (Kish, Survey Sampling, 1965)."""
+    return weight.sum() ** 2 / (weight @ weight)
 
 
 def _unlabelled(

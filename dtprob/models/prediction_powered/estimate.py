@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final, final, get_args
 
@@ -13,8 +14,8 @@ from scipy import special
 
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.prediction_powered.arrays import Values, namespace
-from dtprob.models.prediction_powered.covariance import inverse_hessian, spread
-from dtprob.models.prediction_powered.losses import AbstractLoss, named_loss
+from dtprob.models.prediction_powered.covariance import effective_number, inverse_hessian, spread
+from dtprob.models.prediction_powered.losses import LOSSES, AbstractLoss, SmoothQuantile, named_loss
 from dtprob.models.prediction_powered.moments import Evaluation, evaluate
 from dtprob.models.prediction_powered.quantile import Quantile, estimate_quantile
 from dtprob.models.prediction_powered.result import Estimate
@@ -25,6 +26,12 @@ from dtprob.models.prediction_powered.tuning import CAREFUL, By, Lambda, Practic
 
 NO_UNLABELLED: Final = "There are no unlabelled samples with predictions, so this is plain ERM."
 BIASED: Final = "The interval does not cover the bias of the predictor."
+_FEWEST_PER_CONTEXT: Final = 20
+"""Labels of a context below which its lambda is hardly known."""
+_FEWEST_BEYOND: Final = 5
+"""Labels expected beyond a quantile below which its normal approximation is poor."""
+_FEWEST_EFFECTIVE: Final = 30
+"""Effective labels below which intervals are not right to first order."""
 
 
 def estimate(
@@ -63,8 +70,34 @@ def estimate(
     if isinstance(loss, Quantile):
         result = estimate_quantile(loss, sample, chosen, level=level, practice=practice)
     else:
-        result = _estimate(_problem(named_loss(loss), sample, chosen, practice), by, level)
-    return replace(result, notes=notes)
+        known = named_loss(loss)
+        check_labels(known, sample.y)
+        result = _estimate(_problem(known, sample, chosen, practice), by, level)
+    return replace(result, notes=(*notes, *_few(loss, sample, chosen, by)))
+
+
+def _few(loss: str | AbstractLoss | Quantile, sample: Sample, scheme: Scheme, by: By) -> Iterator[str]:
+    """Where so few labels tell the variance, a quantile or a lambda that the interval may be too narrow."""
+    number = float(effective_number(sample.labelled_weight))
+    if isinstance(loss, Quantile | SmoothQuantile):
+        beyond = number * min(loss.level, 1 - loss.level)
+        if beyond < _FEWEST_BEYOND:
+            yield (
+                f"Only {beyond:.1f} labels are expected beyond the quantile {loss.level:g}, so that the interval may be "
+                f"too narrow. Give more labels, or ask for a quantile nearer to the median."
+            )
+    if sample.weight is not None and number < _FEWEST_EFFECTIVE:
+        yield (
+            f"The weights leave {number:.0f} effective labels of {sample.n}, so that the interval may be too narrow."
+        )
+    if by == "context" and scheme.is_tuned:
+        poor = np.flatnonzero(np.bincount(sample.labelled_context) < _FEWEST_PER_CONTEXT)
+        if len(poor):
+            shown = ", ".join(map(str, poor[:10])) + (", ..." if len(poor) > 10 else "")
+            yield (
+                f"Fewer than {_FEWEST_PER_CONTEXT} labels in contexts {shown}, so that the interval may be too narrow. "
+                "Join contexts, or tune overall."
+            )
 
 
 def _checked(scheme: Scheme, lam: float | None, level: float) -> Scheme:
@@ -92,7 +125,7 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         theta = problem.solve(lam, theta, evaluation)
         evaluation = problem.at(theta)
         inverse = inverse if problem.is_translation else problem.inverse(evaluation, lam)
-    found = spread(evaluation, problem.mixes(lam.value), inverse, practice)
+    found = spread(evaluation, problem.mixes(lam.value), inverse, practice, problem.tuned(by))
     alone = spread(evaluation, problem.labels_alone(lam), inverse, practice)
     covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
     chance = (1 + level) / 2
@@ -113,6 +146,25 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         n=sample.n,
         n_unlabelled=sample.n_unlabelled if sample.has_predictions else 0,
     )
+
+
+def check_labels(loss: AbstractLoss, y: np.ndarray) -> None:
+    """Refuse labels outside of what a named loss is made for, such as classes -1 and 1 of a logistic regression.
+
+    Args:
+        loss: any.
+        y: labels, (n,) or (n, label).
+
+    Raises:
+        InputError: a label that the loss does not allow, with the names of other losses.
+    """
+    name = next((name for name, one in LOSSES.items() if one is loss), "")
+    allowed = {"logistic": (y >= 0) & (y <= 1), "poisson": y >= 0}.get(name, np.ones(y.shape, bool))
+    if not allowed.all():
+        wrong = float(y[~allowed][0])
+        expected = "labels 0 and 1" if name == "logistic" else "labels from 0 up"
+        others = ", ".join(other for other in LOSSES if other != name)
+        raise InputError(f"y with loss {name}", expected, f"{wrong:g}", f"Correct y, or use {others}")
 
 
 def _check_contexts(by: By, loss: str | AbstractLoss | Quantile, sample: Sample, practice: Practice) -> None:
@@ -179,6 +231,11 @@ class _Problem:
         """Whether theta only shifts the gradients, so that one evaluation tells all."""
         weighted = self.sample.weight is not None or self.sample.weight_unlabelled is not None
         return self.loss.traits.translation and not weighted
+
+    def tuned(self, by: By) -> int:
+        """Degrees of freedom that the tuned lambdas cost: one for each beyond the first, none where `lost` is given."""
+        counts = by == "context" and self.rounds > 0 and self.practice.lost is None
+        return self.sample.n_context - 1 if counts else 0
 
     def at(self, theta: Float[Values, " parameter"]) -> Evaluation:
         return self.start if self.is_translation else evaluate(self.loss, self.sample, theta)

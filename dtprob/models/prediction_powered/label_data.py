@@ -11,9 +11,9 @@ from jaxtyping import Float, Int
 from dtprob.data import Labels
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.prediction_powered.diagnostics import BiasMap, Region, bias_map, worth
-from dtprob.models.prediction_powered.estimate import Estimate, estimate
+from dtprob.models.prediction_powered.estimate import Estimate, check_labels, estimate
 from dtprob.models.prediction_powered.generalised import Calibration, posterior_data
-from dtprob.models.prediction_powered.losses import LOSSES, named_loss
+from dtprob.models.prediction_powered.losses import named_loss
 from dtprob.models.prediction_powered.predictors import JaxPredictor, Neighbours, Ridge
 from dtprob.models.prediction_powered.sample import Sample
 from dtprob.models.prediction_powered.training import train
@@ -60,7 +60,7 @@ def label_data(
             than folds, training labels of one class.
     """
     chosen = named_loss(loss)
-    _check_labels(data, loss)
+    check_labels(chosen, data.y[data.labelled])
     if by == "context" and data.context is None:
         remedy = "Add a column context with whole numbers from 0, or tune overall"
         raise InputError("labels", "a context of each row, to tune by context", "none", remedy)
@@ -108,16 +108,6 @@ def _split(
     own = {name: column[mine] for name, column in there.items()}
     other = {f"{name}_unlabelled": column[rest] for name, column in there.items()}
     return own | other if len(rest) else own
-
-
-def _check_labels(data: Labels, loss: str) -> None:
-    y = data.y[data.labelled]
-    allowed = {"logistic": np.isin(y, (0.0, 1.0)), "poisson": y >= 0}.get(loss, np.ones(len(y), bool))
-    if not allowed.all():
-        wrong = float(y[np.argmin(allowed)])
-        expected = "labels 0 and 1" if loss == "logistic" else "labels from 0 up"
-        others = ", ".join(name for name in LOSSES if name != loss)
-        raise InputError(f"y with loss {loss}", expected, f"{wrong:g}", f"Correct y, or use {others}")
 
 
 def _biases(data: Labels, sample: Sample) -> Generator[str]:

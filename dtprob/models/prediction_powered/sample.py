@@ -35,7 +35,7 @@ class Sample:
     """Labelled and unlabelled samples with predictions, checked when made.
 
     The unlabelled arrays may be anything that has a shape and is cut by slices (a NumPy or JAX array, a
-    memory map, an HDF5 or Zarr array); they are read one chunk at a time, and held whole only if they fit in
+    memory map, an HDF5 or Zarr array), or lists; they are read one chunk at a time, and held whole only if they fit in
     one.
 
     Attributes:
@@ -54,8 +54,8 @@ class Sample:
         chunk: rows of a chunk; by default about 128 MB.
 
     Raises:
-        InputError: shapes that do not fit together, NaN or infinity among labels, features or predictions of
-            labelled samples, negative weights.
+        InputError: shapes that do not fit together, more predictors than samples, NaN or infinity among labels,
+            features or predictions of labelled samples, negative weights.
     """
 
     y: np.ndarray
@@ -72,6 +72,9 @@ class Sample:
 
     def __post_init__(self) -> None:
         """Check everything that can be checked without a pass over the unlabelled data."""
+        for name in ("x_unlabelled", "prediction_unlabelled"):
+            if isinstance(getattr(self, name), (list, tuple)):
+                self._set(name, np.asarray(getattr(self, name)))
         labels = np.asarray(self.y)
         if labels.ndim not in (1, 2) or not len(labels):
             got = f"shape {labels.shape}"
@@ -114,7 +117,8 @@ class Sample:
             remedy = "Predict the labelled samples too, each without its own label"
             raise InputError("prediction", "predictions of the labelled samples", "nothing", remedy)
         if not callable(self.prediction_unlabelled):
-            _prediction_shape(self.prediction_unlabelled.shape, count, self.y.shape[1:])
+            shape = _prediction_shape(self.prediction_unlabelled.shape, count, self.y.shape[1:])
+            _check_predictors(shape[1], count, self.n)
         highest = -1 if self.context_unlabelled is None else int(self.context_unlabelled.max())
         if highest >= self.n_context:
             got = f"context {highest}"
@@ -248,6 +252,14 @@ def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]
         return shape
     expected = f"shape {(count, *label)}, or a further axis of predictors after the first"
     raise InputError("prediction_unlabelled", expected, str(shape), "Give a prediction per unlabelled sample")
+
+
+def _check_predictors(predictors: int, count: int, n: int) -> None:
+    """Refuse more predictors than one could train: axes in the wrong order would pass for samples without spread."""
+    if predictors > 1 and predictors > min(count, n):
+        expected = f"axes (sample, predictor), of {n} labels no more than {n} predictors"
+        got = f"{predictors} predictors of {count} samples"
+        raise InputError("prediction_unlabelled", expected, got, "Transpose it")
 
 
 def _real(name: str, array: np.ndarray) -> np.ndarray:

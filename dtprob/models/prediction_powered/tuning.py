@@ -35,7 +35,8 @@ class Practice:
             the mean square error where the predictor is useless; the guard takes two thirds of that away.
         pooled_spread: estimate the spread of f and f~ from both together, as if they had one distribution;
             otherwise each from its own samples.
-        lost: degrees of freedom that the labelled samples lose; None counts the parameters.
+        lost: degrees of freedom that the labelled samples lose; None counts the parameters, and
+            the lambdas of contexts beyond the first.
         form: "loss" minimises the corrected loss; "estimates" corrects the minimiser instead: labels' own
             plus lambda times (that of unlabelled predictions minus that of labelled ones), as PPBoot does.
         reference: "t" compares with Student's t with Welch's degrees of freedom, "normal" with the normal.

@@ -31,8 +31,8 @@ class Response(NamedTuple):
         field: E_z over that of the source alone at 1 m, seen from far away: a ray of length L in m adds
             its reflection coefficients times exp(-j k L) / sqrt(L). m^(-1/2).
         misaligned: largest distance of a surface from the nodes, in cells.
-        tail: largest field at any probe in the last twentieth of the time over that of all times; what was
-            cut off is about as large.
+        tail: largest field at a probe in the last twentieth of the time over its largest of all times, of the probe
+            where that is most, 1 if it saw nothing; what was cut off is about as large.
         record: the field over time at each probe, V/m, one sample per `step`, where it was asked for.
         step: time step, s.
     """
@@ -108,13 +108,15 @@ def simulate(
 
     Raises:
         InputError: the source or a probe outside the scene, in metal or, the source, in another medium than air;
-            fewer than ten cells per wavelength or than 2 pi in a medium; frequencies too far apart; a duration that is
-            too short for the pulse.
+            probes of another shape; fewer than ten cells per wavelength or than 2 pi in a medium; frequencies too far
+            apart; a duration that is too short for the pulse to reach the farthest probe.
     """
     frequency = np.asarray(frequency, np.float64)
     probes = np.asarray(probes, np.float64)
+    if probes.ndim != 2 or probes.shape[1] != 2:
+        raise InputError("probes", "shape (probe, 2), in m", f"shape {probes.shape}", "Give x and y of each")
     _check(scene, source, probes, frequency, cells)
-    _check_duration(duration, frequency)
+    _check_duration(duration, frequency, np.linalg.norm(probes - np.asarray(source), axis=1).max(initial=0.0))
     grid = _grid(scene, frequency, cells)
     middle = float(np.mean(frequency))
     steps = _steps(grid, duration)
@@ -122,7 +124,7 @@ def simulate(
     raster = rasterise(scene, grid.x, grid.y, partial(acting, grid, middle))
     media = factors(grid, raster, middle)
     places = patches(grid, np.asarray([source])), patches(grid, probes)
-    seen = _Seen(len(probes), grid, frequency, keep_record=keep_record)
+    seen = _Seen(len(probes), grid, frequency, steps, keep_record=keep_record)
     state = rest(grid)
     drive = -current * np.sqrt(mu_0 / epsilon_0) / grid.spacing
     for start in range(0, steps, _CHUNK):
@@ -132,7 +134,7 @@ def simulate(
             report(min(start + _CHUNK, steps), steps)
     record = np.concatenate(seen.kept).T if keep_record else None
     spectrum = seen.field / _reference(grid, frequency, current)
-    return Response(frequency, spectrum, _misaligned(scene, grid), seen.tail(steps), record, grid.step)
+    return Response(frequency, spectrum, _misaligned(scene, grid), seen.tail(), record, grid.step)
 
 
 def ricker(time: Float[np.ndarray, " step"], frequency: float) -> Float[np.ndarray, " step"]:
@@ -145,26 +147,35 @@ class _Seen:
     """The running Fourier transform of what the probes see, in double precision."""
 
     def __init__(
-        self, probes: int, grid: Grid, frequency: Float[np.ndarray, " frequency"], *, keep_record: bool
+        self,
+        probes: int,
+        grid: Grid,
+        frequency: Float[np.ndarray, " frequency"],
+        steps: int,
+        *,
+        keep_record: bool,
     ) -> None:
         self.field = np.zeros((probes, len(frequency)), complex)
         self.kept: list[np.ndarray] = []
         self._grid, self._keep = grid, keep_record
         self._turns = -2j * np.pi * grid_frequency(grid, frequency) * grid.step
-        self._peaks: list[np.ndarray] = []
+        self._last = int(steps * (1 - _TAIL))
+        self._most, self._late = np.zeros(probes), np.zeros(probes)
 
     def add(self, series: Float[np.ndarray, "step probe"], start: int) -> None:
         """Take in the field after some steps, the first of number `start`."""
         instants = start + 1 + np.arange(len(series))
         self.field += series.T.astype(np.float64) @ np.exp(instants[:, None] * self._turns)
-        self._peaks.append(np.abs(series).max(axis=1, initial=0.0))
+        size = np.abs(series)
+        self._most = np.maximum(self._most, size.max(axis=0))
+        self._late = np.maximum(self._late, size[max(self._last - start, 0) :].max(axis=0, initial=0.0))
         if self._keep:
             self.kept.append(series)
 
-    def tail(self, steps: int) -> float:
+    def tail(self) -> float:
         """See `Response.tail`."""
-        peaks = np.concatenate(self._peaks)
-        return float(peaks[int(steps * (1 - _TAIL)) :].max() / max(peaks.max(), np.finfo(float).tiny))
+        heard = self._most > 0
+        return float(np.where(heard, self._late / np.where(heard, self._most, 1.0), 1.0).max(initial=0.0))
 
 
 def _chunk(
@@ -237,8 +248,9 @@ def _check_place(name: str, scene: Scene2D, place: tuple[float, float], *, in_ai
         raise InputError(name, expected, f"({place[0]:g}, {place[1]:g})", "Move it")
 
 
-def _check_duration(duration: float, frequency: Float[np.ndarray, " frequency"]) -> None:
-    pulse = 2 * _LATE / float(np.mean(frequency))
-    if not duration >= pulse:
+def _check_duration(duration: float, frequency: Float[np.ndarray, " frequency"], farthest: float) -> None:
+    least = 2 * _LATE / float(np.mean(frequency)) + farthest / SPEED_OF_LIGHT
+    if not duration >= least:
+        expected = f"at least the {least:.3g} s in which the pulse has passed the farthest probe"
         remedy = "Add the delay of the last echo that matters to that of the pulse"
-        raise InputError("duration", f"at least the {pulse:.3g} s of the pulse", f"{duration:g}", remedy)
+        raise InputError("duration", expected, f"{duration:g}", remedy)

@@ -9,8 +9,8 @@ from dtprob.raytracing.calibration.calibrate import (
     Calibration,
     calibrate,
     calibrate_runs,
-    object_groups,
 )
+from dtprob.raytracing.calibration.groups import object_groups
 from dtprob.raytracing.calibration.settings import SCHEMES, Scheme, Settings
 from dtprob.raytracing.calibration.statistics import Statistics, project
 

@@ -1,6 +1,7 @@
 """The loop of a calibration: an E-step for the phases, a gradient step for the materials."""
 
-from collections.abc import Callable, Sequence
+import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,8 +12,9 @@ import optax
 from jax import lax
 from jaxtyping import Array, Complex, Float, Int
 
-from dtprob.errors import InputError, unknown_name
+from dtprob.errors import InputError
 from dtprob.raytracing.calibration import phases
+from dtprob.raytracing.calibration.groups import check_groups, untouched
 from dtprob.raytracing.calibration.phases import Field, Phasors
 from dtprob.raytracing.calibration.settings import Settings
 from dtprob.raytracing.calibration.statistics import Statistics
@@ -78,6 +80,8 @@ def calibrate(
 ) -> Calibration:
     """Fit the materials of a scene to measured channels.
 
+    Groups of objects that no path touches keep the scene's values, and a warning names them.
+
     Args:
         paths: of the twin.
         statistics: of the measurement against these paths, from `project`.
@@ -88,7 +92,7 @@ def calibrate(
 
     Raises:
         InputError: statistics of other links or paths, without what the scheme needs, a noise power that is not
-            positive, or groups that do not fit.
+            positive or of another shape, or groups that do not fit.
     """
     runs = jax.tree.map(lambda leaf: leaf[None], statistics)
     found = calibrate_runs(paths, runs, jnp.asarray(noise_power)[None], settings=settings, groups=groups)
@@ -119,31 +123,22 @@ def calibrate_runs(
     power = power.reshape(power.shape[0], -1)
     power = jnp.broadcast_to(power, (power.shape[0], paths.n_link))
     task = _Task(paths, jnp.asarray(table), int(table.max(initial=0)) + 1, chosen)
-    return _runs(task, statistics, power)
+    return _with_nominal(paths, _runs(task, statistics, power), untouched(paths, table))
 
 
-def object_groups(paths: PathSet, together: Sequence[Sequence[str]]) -> Int[np.ndarray, " object"]:
-    """The argument `groups` of a calibration from names: each list shares one material, other objects keep their class's.
-
-    Args:
-        paths: of the twin.
-        together: names of the objects of each group.
-
-    Raises:
-        InputError: the scene has no object of a name, or one is in two groups.
-    """
-    label: list[str | int] = [paths.material_names[i] for i in np.asarray(paths.object_material)]
-    seen: set[str] = set()
-    for number, names in enumerate(together):
-        for name in names:
-            if name not in paths.object_names:
-                raise unknown_name("object of a group", name, paths.object_names, "object")
-            if name in seen:
-                raise InputError("groups", "an object in one group at most", f"'{name}' in two", "Choose one")
-            seen.add(name)
-            label[paths.object_names.index(name)] = number
-    order = {one: number for number, one in enumerate(dict.fromkeys(label))}
-    return np.asarray([order[one] for one in label])
+def _with_nominal(paths: PathSet, found: Calibration, idle: np.ndarray) -> Calibration:
+    """Give some objects the scene's own values, and say which."""
+    if not np.any(idle):
+        return found
+    names = [name for name, one in zip(paths.object_names, idle, strict=True) if one]
+    shown = ", ".join(names[:10]) + (f" and {len(names) - 10} more" if len(names) > 10 else "")
+    text = (
+        f"no path touches the material of {shown}, which the scene's own values stand for; trace more links."
+    )
+    warnings.warn(text, RuntimeWarning, stacklevel=3)
+    permittivity = jnp.where(idle, jnp.asarray(paths.permittivity), found.permittivity)
+    conductivity = jnp.where(idle, jnp.asarray(paths.conductivity), found.conductivity)
+    return found._replace(permittivity=permittivity, conductivity=conductivity)
 
 
 def _check(
@@ -158,14 +153,15 @@ def _check(
     if settings.scheme == "uniform" and statistics.power is None:
         remedy = "Project with powers=True"
         raise InputError("statistics for the scheme 'uniform'", "powers", "none", remedy)
+    runs = statistics.energy.shape[0]
+    if np.shape(noise_power) not in {(runs,), (runs, paths.n_link)}:
+        expected = f"one value, or one for each of {paths.n_link} links, of each of {runs} runs"
+        got = f"shape {np.shape(noise_power)}"
+        raise InputError("noise_power", expected, got, "Average it over antennas and subcarriers")
     if np.any(~(np.asarray(noise_power) > 0)):
         got = str(np.asarray(noise_power).min())
         raise InputError("noise_power", "positive values", got, "Give the variance of the noise")
-    whole = groups.shape == (paths.n_object,) and np.issubdtype(groups.dtype, np.integer)
-    if not whole or set(np.unique(groups).tolist()) != set(range(int(groups.max(initial=0)) + 1)):
-        expected = f"a number from 0 on for each of the {paths.n_object} objects, none left out"
-        got = np.array2string(groups, threshold=8)
-        raise InputError("groups", expected, got, "Number the groups without gaps")
+    check_groups(paths, groups)
 
 
 @eqx.filter_jit

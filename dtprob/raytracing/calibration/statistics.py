@@ -15,6 +15,7 @@ from jax import lax
 from jax.core import Tracer
 from jaxtyping import Array, Complex, Float
 
+from dtprob.data.tones import check_tones
 from dtprob.errors import InputError
 from dtprob.raytracing.field import frequency_response, steering
 from dtprob.raytracing.paths import PathSet
@@ -83,8 +84,10 @@ def project(
         powers: whether to keep what the scheme "uniform" needs, whose cost grows with the cube of the number of paths.
 
     Raises:
-        InputError: the channel has another shape, or holds NaN or infinity.
+        InputError: the channel has another shape, or holds NaN or infinity; frequencies that count from zero, or not in Hz.
     """
+    if not isinstance(subcarrier_frequency, Tracer):
+        check_tones(np.asarray(subcarrier_frequency), paths.frequency)
     responses = _responses(paths, subcarrier_frequency, rx_array, tx_array)
     _check_shape(paths, responses, channel)
     if not isinstance(channel, Tracer) and not np.all(np.isfinite(np.asarray(channel))):

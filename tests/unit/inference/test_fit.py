@@ -116,4 +116,4 @@ def test_chains_do_not_stand_where_the_density_is_nowhere_finite(engine):
             numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
 
     with pytest.raises(InputError, match="expected a finite log density, got none at any start"):
-        fit(model, {"y": jnp.array([2.9, jnp.nan, 2.0])}, engine=engine, key=jax.random.key(0))
+        fit(model, {"y": jnp.array([2.9, jnp.inf, 2.0])}, engine=engine, key=jax.random.key(0))

@@ -114,7 +114,7 @@ def test_a_flat_direction_is_reported():
 
 
 def test_failures_and_settings_are_told():
-    data = {**normal_data(), "y": np.full(12, np.nan)}
+    data = {**normal_data(), "y": np.full(12, np.inf)}
     with pytest.raises(InputError, match="a finite log density, got none at any start"):
         Laplace()(KEY, normal, data)
     with pytest.raises(InputError, match="draws of engine laplace: expected 1 or more, got 0"):

@@ -290,3 +290,28 @@ def test_a_site_with_obs_mask_is_refused():
 
     with pytest.raises(InputError, match="observed site 'y': expected no obs_mask, got one"):
         build_target(split, {"seen": np.array([True, False, True]), "y": np.zeros(3)})
+
+
+def with_holes(x, y=None, seen=None):
+    slope = numpyro.sample("slope", dist.Normal(0.0, 1.0))
+    with numpyro.plate("row", len(x)):
+        numpyro.sample("y", dist.Normal(slope * x, 1.0).mask(True if seen is None else seen), obs=y)
+
+
+def test_data_that_are_no_numbers_are_named():
+    x, holes = np.arange(5.0), np.where(np.arange(5) == 2, np.nan, 1.0)
+    for data, text in (
+        (
+            {"x": x, "y": holes},
+            r"data 'y': expected finite numbers, got NaN at index \[2\]\. Leave the reading out",
+        ),
+        ({"x": holes, "y": x}, "data 'x': expected finite numbers"),
+    ):
+        with pytest.raises(InputError, match=text):
+            build_target(with_holes, data)
+
+
+def test_what_a_model_masks_may_be_no_number():
+    x, holes = np.arange(5.0), np.where(np.arange(5) == 2, np.nan, 1.0)
+    found = Laplace(draws=10)(KEY, with_holes, {"x": x, "y": holes, "seen": np.isfinite(holes)})
+    assert found.extra["mode.slope"] == pytest.approx(8.0 / 27.0)

@@ -133,6 +133,15 @@ def test_known_materials_are_the_scenes(paths, data):
     np.testing.assert_array_equal(trace["permittivity"]["value"], paths.permittivity)
 
 
+@pytest.mark.parametrize(
+    ("power", "got"),
+    [(0.0, "got 0"), (np.array([1.0, -2.0, 1.0]), "got -2"), (np.ones(2), r"got shape \(2,\)")],
+)
+def test_noise_powers_that_do_not_fit(paths, data, power, got):
+    with pytest.raises(InputError, match=f"noise_power: expected positive values, one .* of 3 links, {got}"):
+        run(ray_traced_channel, data, {}, noise_power=power)
+
+
 def test_an_unknown_noise_power_is_learned(paths, data):
     free = {name: value for name, value in data.items() if name != "noise_power"}
     prior = run(ray_traced_channel, free, materials(paths))["noise_level"]["fn"]

@@ -188,6 +188,23 @@ def test_the_energy_leaves():
     assert small(duration=8e-9).tail < 1e-5
 
 
+def test_the_tail_is_that_of_the_probe_that_hears_most_of_it():
+    found = small(keep_record=True, duration=0.7e-9)
+    size = np.abs(found.record)
+    shares = size[:, int(0.95 * size.shape[1]) :].max(axis=1) / size.max(axis=1)
+    assert found.tail == pytest.approx(shares.max(), rel=1e-6)
+    late = size[:, int(0.95 * size.shape[1]) :].max() / size.max()
+    assert late < 0.95 * shares.max()
+
+
+def test_a_probe_that_hears_nothing_has_its_all_cut_off():
+    """Behind metal all round."""
+    (x, y), wall = PROBES[0], 0.1 * WAVELENGTH
+    box = [Rectangle((x - 3 * wall, y - 3 * wall), (x + 3 * wall, y + 3 * wall), METAL)]
+    room = [*box, Rectangle((x - 2 * wall, y - 2 * wall), (x + 2 * wall, y + 2 * wall), AIR)]
+    assert small(Scene2D(SMALL.lower, SMALL.upper, tuple(room)), probes=PROBES[:1]).tail == 1.0
+
+
 def test_the_pulse_is_strongest_at_its_frequency():
     time = np.linspace(-1e-9, 1e-9, 4001)
     spectrum = [abs(np.sum(ricker(time, 6e9) * np.exp(-2j * np.pi * f * time))) for f in (5e9, 6e9, 7e9)]
@@ -220,7 +237,11 @@ STONE = Scene2D(SMALL.lower, SMALL.upper, (Rectangle((0.0, 0.0), (0.05, 0.05), M
         ),
         (lambda: small(cells=8), "cells per wavelength: expected at least 10"),
         (lambda: small(STONE, source=(0.09, 0.07)), "cells per wavelength: expected at least 21.8"),
-        (lambda: small(duration=1e-10), "duration: expected at least the 4e-10 s of the pulse"),
+        (
+            lambda: small(duration=5e-10),
+            "duration: expected at least the 6.17e-10 s in which the pulse has passed",
+        ),
+        (lambda: small(probes=PROBES[0]), r"probes: expected shape \(probe, 2\), in m, got shape \(2,\)"),
         (lambda: simulate(SMALL, SOURCE, PROBES, np.array([1e9, 6e9]), duration=2e-9), "around one carrier"),
     ],
 )

@@ -267,6 +267,11 @@ def test_bad_input_is_named(paths, array):
         ({"tx_array": None}, "tx_antenna: expected the 1 of tx_array, got 9"),
         ({"paths": paths.take([0])}, "link: expected the 1 of the path set"),
         ({"channel": h[0]}, "all five"),
+        (
+            {"subcarrier_frequency": TONES + 3.5e9},
+            "Hz from the carrier, 3.5e.09 Hz, got .* Subtract the carrier",
+        ),
+        ({"subcarrier_frequency": TONES / 1e9}, "different frequencies, got 16 within 0.3 Hz"),
     ):
         right = {"paths": paths, "subcarrier_frequency": TONES, "channel": h}
         with pytest.raises(InputError, match=source):
@@ -323,3 +328,29 @@ def test_a_link_without_signal_spoils_no_calibration(paths, array):
     found = calibrate(paths, heard, power, settings=Settings("aware", iterations=20, law="half_space"))
     assert np.isfinite(found.permittivity).all()
     assert np.isfinite(found.loss).all()
+
+
+def test_a_material_that_no_path_touches_keeps_the_value_of_the_scene(paths, array):
+    first, other = 0, 4
+    met = np.any((np.asarray(paths.object) == other) & (np.asarray(paths.interaction) != NONE), axis=-1)
+    heard = eqx.tree_at(lambda paths: paths.mask, paths, paths.mask & ~met)
+    h = measure(heard, array, np.zeros((paths.n_link, 1, paths.n_path)))
+    statistics = project(heard, TONES, h, rx_array=array, tx_array=array)
+    settings = Settings("oblivious", iterations=3)
+    groups = np.where(np.arange(paths.n_object) == other, 1, 0)
+    with pytest.warns(RuntimeWarning, match=f"no path touches the material of {paths.object_names[other]},"):
+        found = calibrate(heard, statistics, 1e-9, settings=settings, groups=groups)
+    for name in ("permittivity", "conductivity"):
+        value, nominal = getattr(found, name), getattr(paths, name)
+        assert value[other] == nominal[other]
+        assert value[first] == value[first + 1] != nominal[first]
+    together = calibrate(heard, statistics, 1e-9, settings=settings)
+    assert np.ptp(np.asarray(together.permittivity)) == 0
+
+
+@pytest.mark.parametrize("power", [np.ones(2), np.ones((3, 1, 1)), -1.0])
+def test_noise_powers_that_do_not_fit(paths, array, power):
+    h = measure(paths, array, np.zeros((paths.n_link, 1, paths.n_path)))
+    statistics = project(paths, TONES, h, rx_array=array, tx_array=array)
+    with pytest.raises(InputError, match="noise_power: expected"):
+        calibrate(paths, statistics, power)

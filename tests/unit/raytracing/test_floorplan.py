@@ -170,3 +170,22 @@ def test_the_measured_flat(rt):
     assert np.sum(np.asarray(paths.interaction) == REFRACTION) > 50
     gain = path_gain(paths, paths.permittivity, paths.conductivity)
     assert np.all(np.isfinite(gain))
+
+
+@pytest.mark.libllvm
+@pytest.mark.filterwarnings("error")
+def test_a_scene_far_from_the_origin_is_told_of(rt):
+    """At 1 km as many paths as at the origin; at 10 km the solver finds some twice, at 20 km most."""
+    ends = np.array([[1.5, 1.7, 1.3]]), np.array([[2.6, 3.2, 1.1]])
+
+    def count(offset):
+        move = np.array([offset, 0.7 * offset])
+        scene = floorplan_scene(WALLS[:4] + np.tile(move, 2), 2.5, CARRIER)
+        paths = trace(scene, *(end + np.r_[move, 0] for end in ends), max_depth=2, samples=10_000)
+        return int(paths.mask.sum())
+
+    assert count(1e3) == count(0.0)
+    with pytest.warns(RuntimeWarning, match=r"10 km from the origin to 0.6 mm.*move the scene to the origin"):
+        assert count(1e4) > 0
+    with pytest.raises(InputError, match=r"within 17 km.*got 20 km. Move the scene"):
+        count(2e4)

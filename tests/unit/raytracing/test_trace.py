@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dtprob.errors import InputError
+from dtprob.raytracing.carrier import set_frequency
 from dtprob.raytracing.field import path_gain
 from dtprob.raytracing.paths import validate
 from dtprob.raytracing.pattern import field_vector
@@ -214,6 +215,25 @@ def test_frequency_fixes_the_materials(rt):
     assert float(scene.radio_materials["concrete"].conductivity[0]) == 0.5
 
 
+def test_another_frequency_takes_the_materials_along(rt):
+    scene = load_scene("simple_street_canyon", 6e9, merge_shapes=False)
+    scene.radio_materials["marble"].conductivity = 0.5
+    for carrier in (28e9, 3.5e9):
+        set_frequency(scene, carrier)
+        conductivity = float(scene.radio_materials["concrete"].conductivity[0])
+        assert conductivity == pytest.approx(0.0462 * (carrier / 1e9) ** 0.7822, rel=1e-5)
+        assert float(scene.radio_materials["marble"].conductivity[0]) == 0.5
+        paths = trace(scene, ONE, TWO, samples=1000)
+        assert paths.frequency == pytest.approx(carrier, rel=1e-6)
+
+
+def test_a_carrier_set_past_the_materials_is_refused(rt):
+    scene = load_scene("simple_street_canyon", 6e9)
+    scene.frequency = 28e9
+    with pytest.raises(InputError, match=r"6e\+09 Hz, at which its materials were fixed.*set_frequency"):
+        trace(scene, ONE, TWO, samples=1000)
+
+
 ONE, TWO = np.array([[0.0, 0.0, 2.0]]), np.array([[3.0, 0.0, 2.0]])
 REFUSED = {
     "diffraction": ({"diffraction": True}, "Set diffraction to false"),
@@ -222,6 +242,7 @@ REFUSED = {
     "polarization": ({"polarization": "VH"}, "polarization of a single element"),
     "orientation": ({"rx_orientation": np.zeros((2, 3))}, r"three for each of 1 links, got shape \(2, 3\)"),
     "depth": ({"max_depth": -1}, "max_depth of 0 or more"),
+    "real depth": ({"max_depth": 2.0}, "max_depth: expected a whole number, got 2.0"),
     "carrier": ({"frequency": 3e9}, r"2.8e\+10 Hz, got 3e\+09 Hz"),
 }
 

@@ -3,9 +3,15 @@
 import json
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import pytest
 
 from dtprob.inference import Posterior
+from dtprob.inference.fit import fit
 from dtprob.raytracing import storage
 from dtprob.workflow import summary
 
@@ -45,6 +51,46 @@ def test_doubtful_approximations_are_named():
     assert [text.split(" ")[1] for text in warnings] == ["search", "approximation"]
     extra = {"converged": np.asarray(True), "pareto_k": np.asarray(0.3)}
     assert summary.summarise(Posterior(draws=draws, latent=("a",), extra=extra))["warnings"] == []
+
+
+@pytest.mark.parametrize(
+    ("facts", "said"),
+    [
+        ({"replaced": 2}, "does not fall off in 2 directions"),
+        ({"agreeing": 0.25}, "No two of the 4 starts"),
+        ({"agreeing": 0.5, "replaced": 0}, None),
+    ],
+)
+def test_what_laplace_says_of_its_mode_is_passed_on(facts, said):
+    draws = {"a": np.random.default_rng(3).normal(size=(1, 50))}
+    extra = {name: np.asarray(value) for name, value in facts.items()}
+    made_by = {"engine": "laplace", "settings": {"starts": 4}}
+    found = Posterior(draws=draws, latent=("a",), extra=extra, provenance=made_by)
+    warnings = summary.summarise(found)["warnings"]
+    assert len(warnings) == (said is not None)
+    assert all(said in text for text in warnings)
+
+
+def flat_in_one_direction(y=None):
+    level = numpyro.sample("level", dist.Normal(0.0, 1.0))
+    idle = numpyro.sample("idle", dist.Normal(0.0, 1.0))
+    numpyro.factor("flat", 0.5 * idle**2)
+    numpyro.sample("y", dist.Normal(level, 1.0), obs=y)
+
+
+def test_laplace_on_a_density_that_is_flat_in_one_direction():
+    found = fit(flat_in_one_direction, {"y": jnp.zeros(())}, engine="laplace", key=jax.random.key(0))
+    assert any(
+        "does not fall off in 1 direction from" in text for text in summary.summarise(found)["warnings"]
+    )
+
+
+def test_a_mean_that_is_not_finite_is_told_of():
+    draws = np.random.default_rng(3).normal(size=(1, 50))
+    draws[0, 7] = np.inf
+    found = summary.summarise(posterior(a=draws))
+    assert "mean" not in found["parameters"]["a"]
+    assert [text for text in found["warnings"] if "of a are not finite" in text]
 
 
 def test_one_chain_and_large_sites():

@@ -31,6 +31,14 @@ SAMPLES = {
         {"y": Y, "x": X, "x_unlabelled": np.zeros((4, 3))},
         "x_unlabelled: expected width 2, as x has, got width 3",
     ),
+    "predictors first": (
+        {"y": Y, "prediction": Y, "prediction_unlabelled": np.zeros((5, 40))},
+        r"expected axes \(sample, predictor\), .*got 40 predictors of 5 samples\. Transpose it",
+    ),
+    "more predictors than labels": (
+        {"y": Y, "prediction": Y, "prediction_unlabelled": np.zeros((40, 7))},
+        "of 6 labels no more than 6 predictors, got 7 predictors of 40 samples",
+    ),
     "no own predictions": ({"y": Y, "prediction_unlabelled": Y}, "prediction: expected predictions of the"),
     "negative weight": ({"y": Y, "weight": -Y}, r"weight: expected weights from 0 up, got -1 at index 1"),
     "no weight": ({"y": Y, "weight": 0 * Y}, "weight: expected a weight above 0"),
@@ -48,7 +56,18 @@ SAMPLES = {
 }
 CALLS = {
     "scheme": (lambda: estimate("mean", scalar(), "tuned-cppi"), r"Did you mean 'tuned_cppi'\?"),
-    "loss": (lambda: estimate("logistc", linear()), r"Did you mean 'logistic'\?"),
+    "loss": (
+        lambda: estimate("logistc", linear()),
+        r"one of the losses logistic, .*Did you mean 'logistic'\?",
+    ),
+    "classes -1 and 1": (
+        lambda: estimate("logistic", Sample(x=X, y=np.sign(Y - 2.5)), "erm"),
+        "y with loss logistic: expected labels 0 and 1, got -1. Correct y, or use mean, ols, poisson",
+    ),
+    "negative counts": (
+        lambda: estimate("poisson", Sample(x=X, y=Y - 1), "erm"),
+        "y with loss poisson: expected labels from 0 up, got -1",
+    ),
     "no loss": (lambda: estimate(lambda t, x, y: t, linear()), "Wrap a function in CustomLoss"),
     "level": (lambda: estimate("mean", scalar(), level=90), "level: expected a number between 0 and 1"),
     "lambda": (lambda: estimate("mean", scalar(), lam=2), "lam: expected a number from 0 to 1"),

@@ -99,3 +99,12 @@ def test_resamples_lie_about_the_estimate(scheme):
     found = estimate(Quantile(0.2), sample, scheme)
     draws = bootstrap_draws(jax.random.key(9), Quantile(0.2), sample, found, 2000)[:, 0]
     assert 0.4 < np.mean(draws < found.theta) + np.mean(draws == found.theta) / 2 < 0.6
+
+
+@pytest.mark.parametrize(("level", "n", "is_few"), [(0.9, 49, True), (0.9, 51, False), (0.02, 200, True)])
+def test_an_extreme_quantile_of_few_labels_has_a_note(level, n, is_few):
+    """Beyond the .99 quantile, for one, 82% of all samples of 20 labels have none, so that no interval reaches it."""
+    sample = Sample(y=np.random.default_rng(0).normal(size=n))
+    notes = estimate(Quantile(level), sample, "erm").notes
+    assert [note for note in notes if f"beyond the quantile {level}" in note] == list(notes)
+    assert len(notes) == is_few

@@ -57,3 +57,14 @@ def test_what_fills_a_chunk_is_within_the_domain_of_the_loss():
     np.testing.assert_allclose(chunked.theta, whole.theta, rtol=1e-10)
     np.testing.assert_allclose(chunked.covariance, whole.covariance, rtol=1e-10)
     np.testing.assert_allclose(whole.theta, np.log(y[20:]).mean(), rtol=1e-10)  # the factor .9 cancels
+
+
+def test_unlabelled_data_may_be_lists():
+    random = np.random.default_rng(4)
+    x, y, rest = random.normal(size=(30, 1)), random.normal(size=30), random.normal(size=(90, 1))
+    plain = Sample(x=x, y=y, prediction=y / 2, x_unlabelled=rest, prediction_unlabelled=rest[:, 0])
+    listed = Sample(
+        x=x, y=y, prediction=y / 2, x_unlabelled=rest.tolist(), prediction_unlabelled=rest[:, 0].tolist()
+    )
+    found, expected = (estimate("ols", sample, "ppi") for sample in (listed, plain))
+    np.testing.assert_array_equal(found.theta, expected.theta)

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.estimate import estimate
@@ -109,3 +110,41 @@ def test_by_context_needs_contexts():
 def test_a_practice_that_cannot_work_is_refused(settings):
     with pytest.raises(InputError, match="practice: expected rounds from 1"):
         Practice(**settings)
+
+
+def by_context(random, n, contexts):
+    """A mean of 0 whose predictor is good in every other context and bad in the rest."""
+    context, rest = random.integers(0, contexts, n), random.integers(0, contexts, 2000)
+    context[:contexts] = np.arange(contexts)
+    noise = np.where(np.arange(contexts) % 2, 2.0, 0.3)
+    y, other = random.normal(size=n), random.normal(size=2000)
+    return Sample(
+        y=y,
+        prediction=y + noise[context] * random.normal(size=n),
+        prediction_unlabelled=other + noise[rest] * random.normal(size=2000),
+        context=context,
+        context_unlabelled=rest,
+    )
+
+
+def test_lambdas_of_contexts_cost_degrees_of_freedom():
+    sample = by_context(np.random.default_rng(6), 60, 10)
+    found = estimate("mean", sample, "tuned_ppi", by="context")
+    expected = estimate("mean", sample, "tuned_ppi", by="context", practice=Practice(lost=10))
+    for name in ("theta", "covariance", "low", "high"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12)
+    (note,) = found.notes
+    assert note.startswith("Fewer than 20 labels in contexts 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, so that")
+    many = by_context(np.random.default_rng(6), 600, 3)
+    assert estimate("mean", many, "tuned_ppi", by="context").notes == ()
+
+
+@pytest.mark.study
+@pytest.mark.parametrize(("n", "contexts"), [(40, 10), (60, 10), (100, 20)])
+def test_intervals_cover_with_few_labels_per_context(n, contexts):
+    """Of 90%, 4000 times, by an exact binomial bound against .86."""
+    random, covered = np.random.default_rng(7), 0
+    for _ in range(4000):
+        found = estimate("mean", by_context(random, n, contexts), "tuned_ppi", by="context")
+        covered += found.low[0] <= 0 <= found.high[0]
+    assert covered > stats.binom.isf(1e-3, 4000, 0.86)

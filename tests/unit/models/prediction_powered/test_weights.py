@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from dtprob.models.prediction_powered.bootstrap import bootstrap_draws
 from dtprob.models.prediction_powered.estimate import estimate
@@ -39,6 +40,10 @@ def mean_square(weight, values):
     return np.mean((weight * (values - np.mean(weight * values))) ** 2)
 
 
+def kish(weight):
+    return np.sum(weight) ** 2 / np.sum(weight**2)
+
+
 @pytest.mark.parametrize("practice", [CAREFUL, PUBLISHED], ids=["careful", "published"])
 @pytest.mark.parametrize("scheme", ["cppi", "tuned_cppi"])
 def test_a_bias_of_the_predictor_changes_nothing(scheme, practice):
@@ -63,7 +68,8 @@ def test_a_bias_of_the_predictor_does_not_change_resamples(count):
 def test_the_variance_is_that_of_the_weighted_means():
     sample = weighted()
     average = sample.prediction_unlabelled.mean(axis=1)
-    own = mean_square(sample.weight, sample.y - sample.prediction) / (N - 1)
+    effective = kish(sample.weight)
+    own = mean_square(sample.weight, sample.y - sample.prediction) / N * effective / (effective - 1)
     rest = mean_square(sample.weight_unlabelled, average) / (COUNT - 1)
     assert estimate("mean", sample, "cppi").covariance[0, 0] == pytest.approx(own + rest, rel=1e-10)
 
@@ -103,7 +109,9 @@ def test_lambda_of_each_context_and_its_variance(pooled):
     lam = found.lam.value[0]
     own = rows(sample.weight, sample.y - inside @ lam * (sample.prediction - found.theta))
     rest = rows(sample.weight_unlabelled, other @ lam * (average - found.theta))
-    variance = np.sum(own**2) / N / (N - 1) + np.sum(rest**2) / COUNT / (COUNT - 1)
+    effective = kish(sample.weight)
+    variance = np.sum(own**2) / N**2 * effective / (effective - 3)
+    variance += np.sum(rest**2) / COUNT / (COUNT - 1)
     assert found.covariance[0, 0] == pytest.approx(variance, rel=1e-8)
 
 
@@ -126,3 +134,25 @@ def test_quantiles_know_it_too(level):
     variance = problem.variance(problem.steps.at(theta), (1.0, 0.7, 0.7))
     expected = np.mean((g - 0.7 * f) ** 2) / N + 0.49 * np.mean(u**2) / COUNT
     assert variance[0] == pytest.approx(expected, rel=1e-8)
+
+
+def test_whole_weights_have_the_degrees_of_freedom_of_the_labels_that_they_leave():
+    """Weights 1 and 0 are the same as leaving labels out, but for the note."""
+    y = np.random.default_rng(3).normal(size=40)
+    found = estimate("mean", Sample(y=y, weight=(np.arange(40) < 10).astype(float)), "erm")
+    expected = estimate("mean", Sample(y=y[:10]), "erm")
+    for name in ("theta", "low", "high", "degrees"):
+        np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-10)
+    assert any("10 effective labels of 40" in note for note in found.notes)
+    assert not any("effective" in note for note in expected.notes)
+
+
+@pytest.mark.study
+def test_intervals_cover_under_uneven_weights():
+    """Importance weights of which 8 labels of 40 are worth most; 4000 times, by an exact binomial bound against .86."""
+    random, covered = np.random.default_rng(5), 0
+    for _ in range(4000):
+        weight = np.exp(1.2 * random.normal(size=40))
+        found = estimate("mean", Sample(y=random.normal(size=40), weight=weight), "erm")
+        covered += found.low[0] <= 0 <= found.high[0]
+    assert covered > stats.binom.isf(1e-3, 4000, 0.855)
