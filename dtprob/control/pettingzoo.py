@@ -13,6 +13,7 @@ from pettingzoo import AECEnv, ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from dtprob.control.environment import Environment, Observation
+from dtprob.data.actions import actions_in_order
 from dtprob.errors import InputError
 
 type Seen = dict[str, np.ndarray]
@@ -88,7 +89,7 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
             raise InputError("step", "an episode under way", "none", "Call reset first")
         if not self.agents:
             return {}, {}, {}, {}, {}
-        wanted = self._wanted(actions)
+        wanted = actions_in_order(self.agents, actions, self.action_spaces)
         self._key, key = jax.random.split(self._key)
         self._state, step = self._move(key, self._state, jnp.asarray(wanted, jnp.int32))
         agents, done = self.agents, bool(step.truncated)
@@ -106,25 +107,6 @@ class ParallelNetwork(ParallelEnv[str, np.ndarray, int | None]):
             dict.fromkeys(agents, done),
             infos,
         )
-
-    def _wanted(self, actions: Mapping[str, Any]) -> np.ndarray:
-        """The devices' actions in their order.
-
-        Raises:
-            InputError: a device without an action, an action that there is not, or one of no device of the network.
-        """
-        missing = [agent for agent in self.agents if agent not in actions]
-        if missing:
-            remedy = "Give an action for every device"
-            raise InputError("actions", f"one of each of {self.agents}", f"none of {missing}", remedy)
-        for agent, action in actions.items():
-            if agent not in self.agents:
-                raise InputError("actions", f"those of {self.agents}", f"one of {agent!r}", "Leave it out")
-            number = action if isinstance(action, int) else np.asarray(action)
-            if not self.action_space(agent).contains(number):
-                got = repr(action)
-                raise InputError(f"action of {agent}", "0 (silent) or 1 (sends)", got, "Correct it")
-        return np.array([int(actions[agent]) for agent in self.agents])
 
     def state(self) -> np.ndarray:
         """What all devices see, (device, 4)."""

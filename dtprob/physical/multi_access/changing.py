@@ -9,6 +9,7 @@ import numpy as np
 from gymnasium.spaces import Box, Discrete
 from pettingzoo import ParallelEnv
 
+from dtprob.data.actions import actions_in_order
 from dtprob.errors import InputError
 from dtprob.physical.multi_access.kernel import REWARDS
 from dtprob.physical.multi_access.network import Network
@@ -96,7 +97,7 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
             raise InputError("step", "an episode under way", "none", "Call reset first")
         if not agents:
             return {}, {}, {}, {}, {}
-        wanted = self._wanted(actions)
+        wanted = actions_in_order(self.agents, actions, self.action_spaces)
         network = [net for start, net in self._stages if start <= self._total][-1]
         ack, arrival = self._luck(network, (wanted > 0) & (self._seen[:, 0] > 0))
         full = self._seen[:, 0] + arrival - ack
@@ -119,25 +120,6 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
             dict.fromkeys(agents, done),
             infos,
         )
-
-    def _wanted(self, actions: Mapping[str, Any]) -> np.ndarray:
-        """The devices' actions in their order.
-
-        Raises:
-            InputError: a device without an action, an action that there is not, or one of no device of the network.
-        """
-        missing = [agent for agent in self.agents if agent not in actions]
-        if missing:
-            remedy = "Give an action for every device"
-            raise InputError("actions", f"one of each of {self.agents}", f"none of {missing}", remedy)
-        for agent, action in actions.items():
-            if agent not in self.agents:
-                raise InputError("actions", f"those of {self.agents}", f"one of {agent!r}", "Leave it out")
-            number = action if isinstance(action, int) else np.asarray(action)
-            if not self.action_space(agent).contains(number):
-                got = repr(action)
-                raise InputError(f"action of {agent}", "0 (silent) or 1 (sends)", got, "Correct it")
-        return np.array([int(actions[agent]) for agent in self.agents])
 
     def state(self) -> np.ndarray:
         """What all devices see, (device, 4)."""
