@@ -62,17 +62,18 @@ def _refuse_nan(target: Target, inputs: Inputs) -> None:
 def _hole(entry: Any) -> list[int] | None:
     """Where an argument's first NaN is, if it has one."""
     for leaf in jax.tree.leaves(entry):
-        if jnp.issubdtype(leaf.dtype, jnp.inexact) and bool(jnp.isnan(leaf).any()):
-            return np.argwhere(np.isnan(leaf))[0].tolist()
+        if jnp.issubdtype(leaf.dtype, jnp.inexact) and (missing := np.isnan(np.asarray(leaf))).any():
+            return np.argwhere(missing)[0].tolist()
     return None
 
 
 def _filled(leaf: Array) -> Array:
     """An array with one of its own finite values in place of each NaN."""
-    if not jnp.issubdtype(leaf.dtype, jnp.inexact) or not bool(jnp.isnan(leaf).any()):
+    if _hole(leaf) is None:
         return leaf
-    there = np.asarray(leaf)[~np.isnan(leaf)]
-    return jnp.where(jnp.isnan(leaf), there[0] if len(there) else 1.0, leaf)
+    values = np.asarray(leaf)
+    there = values[~np.isnan(values)]
+    return jnp.asarray(np.where(np.isnan(values), there[0] if len(there) else 1.0, values), leaf.dtype)
 
 
 def prior_units(target: Target, draws: np.ndarray) -> tuple[Array, Array]:

@@ -117,7 +117,7 @@ def _tied_within(
 
     So are the log ratios of a table of chances: that of an outcome which was never seen lies in an exponential tail.
     """
-    found, moved = np.zeros(len(x), bool), np.asarray(active.global_index)
+    found, moved = np.zeros(len(x), bool), active.global_index
     for block in base:
         is_own = np.isin(moved, block.index)
         if block.local or is_own.sum() < 2:

@@ -80,8 +80,9 @@ class Scores:
         information, scale = self.information[np.ix_(own, own)], scales(effect)[index]
         return log_bayes_factor(information, self.u[own], scale, one_sided=is_one_sided(effect))
 
+    @cached_property
     def pairs(self) -> tuple[Pair, ...]:
-        """The pairs that explain most together; costly, so made when asked for."""
+        """The pairs that explain most together; costly, so made when first asked for."""
         return best_pairs(
             self.effects, self.groups, self.information, self.u, self.log_bayes_factor, price=self.price
         )

@@ -71,8 +71,8 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
 
     Where a random field was accepted, which can imitate several effects at once, the search goes on without it too, but not
     without one whose place was found, which can imitate little. Where a pair promises as much as was reached, the search
-    starts from that pair. What one family of a site beats, a single effect by far, is taken back: it stands in for what is
-    not known.
+    starts from that pair, or puts it in the place of two effects beside others. What one family of a site beats, a single
+    effect by far, is taken back: it stands in for what is not known.
 
     Args:
         problem: the model and candidates on their data.
@@ -87,23 +87,25 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
     ways = [steps]
     fields = {e.name: e for e in problem.effects if e.kind == "variance"}
     field = next((name for name in end.fitted.effects if name in fields), None)
+
+    def go_on(start: Start, key: jax.Array, goal: float, begun: Step | None = None) -> list[Step]:
+        """The steps from another start, which are one more way."""
+        found = _forward(
+            start.problem, start.fitted, key, settings, say, base=base, banned=field, goal=goal, begun=begun
+        )
+        ways.append([*steps[:-1], *found])
+        return found
+
     if field is not None and not fields[field].is_looked_for:
         say(f"looking for effects that {field} may have imitated")
         rest = refitted_without(end.problem, end.fitted, field)
         key = key_for(key, "without the field")
         goal = credit(problem, end.fitted, base)
-        begun = _without_trial(steps[0], rest.fitted, field)
-        others = _forward(
-            rest.problem, rest.fitted, key, settings, say, base=base, banned=field, goal=goal, begun=begun
-        )
-        ways.append([*steps[:-1], *others])
+        others = go_on(rest, key, goal, _without_trial(steps[0], rest.fitted, field))
         both = beside([step.view for step in others], field, _reached(problem, ways, base), base, settings)
         if both is not None:
             key = key_for(key, "beside the field")
-            others = _forward(
-                both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=goal
-            )
-            ways.append([*steps[:-1], *others])
+            go_on(both, key, goal)
     reached = _reached(problem, ways, base)
     pair = promising(bare, [way[-1].view for way in ways], reached - base.log_evidence, settings)
     if pair is not None:
@@ -111,14 +113,11 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
         both = refitted_with(bare, pair, settings)
         key = key_for(key, "pair")
         if not bound(both.problem, both.fitted):
-            others = _forward(
-                both.problem, both.fitted, key, settings, say, base=base, banned=field, goal=reached
-            )
-            ways.append([*steps[:-1], *others])
-    key = key_for(key, "exchange")
-    others = _exchanged(problem, ways, key, settings, say, base=base, banned=field)
-    if others:
-        ways.append([*steps[:-1], *others])
+            go_on(both, key, reached)
+    reached = _reached(problem, ways, base)
+    other = _exchanged(problem, ways, reached, base, settings, say=say)
+    if other is not None:
+        go_on(other, key_for(key, "exchange"), reached)
     ways = _ranked(problem, ways, base)
     if stands_in(bare, ways[0][-1].view, base, field, say):
         ways.insert(0, [Step(bare, Trials(bare.problem, {}), None)])
@@ -129,25 +128,21 @@ def search(problem: Problem, base: fitting.Fit, key: jax.Array, settings: Settin
 def _exchanged(
     problem: Problem,
     ways: Sequence[Sequence[Step]],
-    key: jax.Array,
-    settings: Settings,
-    say: Say,
-    *,
+    reached: float,
     base: fitting.Fit,
-    banned: str | None,
-) -> list[Step]:
-    """The steps from the best pair that takes the place of two effects that were found; none if it is no better."""
-    reached = _reached(problem, ways, base)
+    settings: Settings,
+    *,
+    say: Say,
+) -> Start | None:
+    """The best pair in the place of two effects that were found, beside the rest; None if it is no better than they are."""
     views, ends = [step.view for way in ways for step in way], [way[-1].view for way in ways]
-    fits = []
+    fits: list[Start] = []
     for seen, pair in exchanged(views, ends, reached, base, settings):
         say(f"refitting with {pair[0]} and {pair[1]} beside {', '.join(seen.fitted.effects)}")
         fits.append(refitted_with(seen, pair, settings))
     better = [one for one in fits if credit(problem, one.fitted, base) > reached + BETTER]
-    start = max(better, key=lambda one: credit(problem, one.fitted, base), default=None)
-    if start is None or bound(start.problem, start.fitted):
-        return []
-    return _forward(start.problem, start.fitted, key, settings, say, base=base, banned=banned, goal=reached)
+    best_fit = max(better, key=lambda one: credit(problem, one.fitted, base), default=None)
+    return None if best_fit is None or bound(best_fit.problem, best_fit.fitted) else best_fit
 
 
 def _ranked(problem: Problem, ways: Sequence[list[Step]], base: fitting.Fit) -> list[list[Step]]:

@@ -43,7 +43,7 @@ def promising(
     found = [set(end.fitted.effects) for end in ends]
     if settings.max_effects < 2 or not any(found):
         return None
-    pairs = first.screening.scores.pairs()
+    pairs = first.screening.scores.pairs
     locating = first.screening.scores.locating
     if any(own <= locating and not end.alarmed(settings) for own, end in zip(found, ends, strict=True)):
         pairs = tuple(pair for pair in pairs if locating.issuperset(pair.names))
@@ -78,7 +78,7 @@ def exchanged(
         if not own or len(own) + 2 > settings.max_effects or not any(own < found for found in known):
             continue
         least = reached - _NEARLY - _UNDERSTATED * (reached - credit(seen.problem, seen.fitted, base))
-        for pair in seen.screening.scores.pairs():
+        for pair in seen.screening.scores.pairs:
             effects = (*seen.fitted.effects, *pair.names)
             evidence = seen.fitted.log_evidence + pair.log_bayes_factor
             promise = credit(seen.problem, replace(seen.fitted, effects=effects, log_evidence=evidence), base)

@@ -97,7 +97,7 @@ class ChangingNetwork(ParallelEnv[str, np.ndarray, int | None]):
             raise InputError("step", "an episode under way", "none", "Call reset first")
         if not agents:
             return {}, {}, {}, {}, {}
-        wanted = actions_in_order(self.agents, actions, self.action_spaces)
+        wanted = actions_in_order(agents, actions, self.action_spaces)
         network = [net for start, net in self._stages if start <= self._total][-1]
         ack, arrival = self._luck(network, (wanted > 0) & (self._seen[:, 0] > 0))
         full = self._seen[:, 0] + arrival - ack

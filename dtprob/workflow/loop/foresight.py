@@ -1,6 +1,6 @@
 """What a policy is foreseen to deliver, on how much of it nobody has seen, and whether the network delivers less."""
 
-from typing import Any, Final, NamedTuple, final
+from typing import Any, Final, final
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ from dtprob.inference.exact import DirichletTables
 from dtprob.models.multi_access import Kernel, priors
 from dtprob.models.multi_access.transition import State as NetworkState
 from dtprob.twin.predict import Prediction, predict
-from dtprob.twin.rollout import throughput
+from dtprob.twin.rollout import Metric, Steps, throughput
 from dtprob.workflow.loop.knowledge import ARRIVAL, RECEPTION, known
 from dtprob.workflow.loop.physical import Chances
 from dtprob.workflow.loop.settings import TwinCase
@@ -28,20 +28,8 @@ RATE: Final = 0.05
 _DRAWS, _EPISODES = 800, 2
 
 
-class Foreseen(NamedTuple):
-    """What is foreseen of a policy.
-
-    Attributes:
-        throughput: packets per slot of episodes of `HORIZON` slots.
-        seldom: share of their slots that take a row seen fewer than `FEW` times.
-    """
-
-    throughput: Prediction
-    seldom: float
-
-
-def foresee(key: jax.Array, case: TwinCase, state: State, policy: Chances) -> Foreseen:
-    """Foresee a policy's episodes under what is known.
+def foresee(key: jax.Array, case: TwinCase, state: State, policy: Chances) -> Prediction:
+    """Packets per slot of a policy's episodes of `HORIZON` slots, under what is known.
 
     Args:
         key: typed JAX key.
@@ -49,23 +37,35 @@ def foresee(key: jax.Array, case: TwinCase, state: State, policy: Chances) -> Fo
         state: with the rows that are known.
         policy: the chances of sending.
     """
+    return _foreseen(key, case.kernel, known(case, state), policy, throughput)
+
+
+def seldom_seen(key: jax.Array, case: TwinCase, state: State, policy: Chances) -> float:
+    """Share of the slots of the episodes that `foresee` foresees that take a row seen fewer than `FEW` times.
+
+    Args:
+        key: as for `foresee`.
+        case: the settings.
+        state: with the rows that are known.
+        policy: the chances of sending.
+    """
     law = known(case, state)
-    noting = _noting(case, law)
-    values = (
-        predict(
-            key,
-            noting,
-            law,
-            policy=Stateless(TablePolicy(jnp.asarray(policy, jnp.result_type(float)))),
-            metric=metric,
-            horizon=HORIZON,
-            draws=_DRAWS,
-            episodes=_EPISODES,
-        )
-        for metric in (throughput, _seldom)
+    return _foreseen(key, _noting(case, law), law, policy, _seldom).mean
+
+
+def _foreseen(
+    key: jax.Array, kernel: Steps, law: DirichletTables, policy: Chances, metric: Metric
+) -> Prediction:
+    return predict(
+        key,
+        kernel,
+        law,
+        policy=Stateless(TablePolicy(jnp.asarray(policy, jnp.result_type(float)))),
+        metric=metric,
+        horizon=HORIZON,
+        draws=_DRAWS,
+        episodes=_EPISODES,
     )
-    delivered, seldom = values
-    return Foreseen(delivered, seldom.mean)
 
 
 def shortfall(state: State) -> dict[str, Any] | None:
@@ -91,13 +91,6 @@ def shortfall(state: State) -> dict[str, Any] | None:
                 "shortfall": {"slots": [first, first + HORIZON], "chance": round(float(chance), 4)},
             }
     return None
-
-
-class _Noted(NamedTuple):
-    """What matters of a slot: who was delivered, and whether it took a row that was seldom seen."""
-
-    delivered: Int[Array, " device"]
-    seldom: Bool[Array, ""]
 
 
 @final
@@ -129,13 +122,13 @@ class _Noting(eqx.Module):
 
     def step(
         self, key: PRNGKeyArray, parameters: Any, state: NetworkState, action: Int[Array, " device"]
-    ) -> tuple[NetworkState, _Noted]:
-        """See `Kernel`."""
-        after, slot = self.kernel.step(key, parameters, state, action)
+    ) -> tuple[NetworkState, Bool[Array, ""]]:
+        """The state after the slot, see `Kernel`, and whether it took a row that was seldom seen."""
+        after, _ = self.kernel.step(key, parameters, state, action)
         senders = jnp.sum((action > 0) & (state.buffer > 0))
         previous = self.kernel.clusters.encode(state.arrival) % self.arrival.shape[1]
         seldom = jnp.any(self.arrival[jnp.arange(len(self.arrival)), previous]) | self.reception[senders]
-        return after, _Noted(slot.delivered, seldom)
+        return after, seldom
 
 
 def _noting(case: TwinCase, law: DirichletTables) -> _Noting:
@@ -149,6 +142,6 @@ def _noting(case: TwinCase, law: DirichletTables) -> _Noting:
     return _Noting(case.kernel, jnp.asarray(seldom[ARRIVAL]), jnp.asarray(seldom[RECEPTION]))
 
 
-def _seldom(slots: _Noted) -> Float[Array, ""]:
+def _seldom(slots: Bool[Array, " slot"]) -> Float[Array, ""]:
     """Share of the slots that take a row seldom seen."""
-    return jnp.mean(slots.seldom, dtype=float)
+    return jnp.mean(slots, dtype=float)

@@ -20,7 +20,7 @@ from dtprob.control import (
 )
 from dtprob.control.learner import check_trained
 from dtprob.workflow.loop.diagnosis import diagnosed
-from dtprob.workflow.loop.foresight import FEW, HORIZON, foresee, shortfall
+from dtprob.workflow.loop.foresight import FEW, HORIZON, foresee, seldom_seen, shortfall
 from dtprob.workflow.loop.knowledge import Watched, forget, known, summary, watch
 from dtprob.workflow.loop.physical import Chances, Physical
 from dtprob.workflow.loop.settings import TwinCase
@@ -98,23 +98,23 @@ def hand_over(twin: Twin, state: State) -> State:
     """Give the devices the trained policy, if it is foreseen to deliver more than the one that they have."""
     key = _key(twin.case, state)
     old, new = (foresee(key, twin.case, state, policy) for policy in (state.policy, state.trained))
-    better = new.throughput.mean > old.throughput.mean
+    better = new.mean > old.mean
     kept = new if better else old
     after = state._replace(
         policy=state.trained if better else state.policy,
-        foreseen=kept.throughput.values.ravel(),
+        foreseen=kept.values.ravel(),
         handed=state.slots,
         watched=state.slots if state.watched < 0 else state.watched,
         changed=-1,
     )
-    means = new.throughput.mean, old.throughput.mean
-    low, high = new.throughput.interval()
+    low, high = new.interval()
+    seldom = seldom_seen(key, twin.case, state, state.trained)
     entry = {
-        "why": f"foreseen over {HORIZON} slots: {means[0]:.3f} packets per slot, with the old one {means[1]:.3f}",
+        "why": f"foreseen over {HORIZON} slots: {new.mean:.3f} packets per slot, with the old one {old.mean:.3f}",
         "handed_over": better,
-        "foreseen": {"mean": round(means[0], 4), "low": round(low, 4), "high": round(high, 4)},
-        "foreseen_with_old": round(means[1], 4),
-        "seldom_seen": {"rows_seen_fewer_times_than": FEW, "share_of_foreseen_slots": round(new.seldom, 4)},
+        "foreseen": {"mean": round(new.mean, 4), "low": round(low, 4), "high": round(high, 4)},
+        "foreseen_with_old": round(old.mean, 4),
+        "seldom_seen": {"rows_seen_fewer_times_than": FEW, "share_of_foreseen_slots": round(seldom, 4)},
     }
     return _next(twin, state, after, "monitor", entry)
 

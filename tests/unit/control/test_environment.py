@@ -14,6 +14,7 @@ from dtprob.errors import InputError
 from dtprob.inference import PointMass
 from dtprob.models.multi_access import kernel
 from dtprob.physical.multi_access import PhysicalKernel
+from tests.refused_actions import NO_ACTIONS, check_refused
 from tests.unit.control.networks import NETWORK, truth, world
 
 SEND = jnp.ones(4, jnp.int32)
@@ -129,16 +130,11 @@ def test_without_a_seed_each_network_has_luck_of_its_own():
     assert not np.array_equal(*played)
 
 
-@pytest.mark.parametrize("action", [7, -1, 0.9, float("nan"), None, "1"])
+@pytest.mark.parametrize("action", NO_ACTIONS)
 def test_actions_that_there_are_not_are_refused(action):
     network = ParallelNetwork(world(NETWORK, horizon=3))
     network.reset(seed=1)
-    everyone = dict.fromkeys(network.agents, np.int64(1))
-    with pytest.raises(InputError, match=r"action of device_0: expected 0 \(silent\) or 1 \(sends\)"):
-        network.step({**everyone, "device_0": action})
-    with pytest.raises(InputError, match="one of 'device_9'"):
-        network.step({**everyone, "device_9": 1})
-    assert network.step(everyone)[0]["device_0"][3] == 1
+    check_refused(network, action)
 
 
 def test_devices_sample_actions_of_their_own():

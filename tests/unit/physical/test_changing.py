@@ -7,6 +7,7 @@ from pettingzoo.test import parallel_api_test, parallel_seed_test
 from dtprob.errors import InputError
 from dtprob.physical.multi_access import Network, average, chain, tdma
 from dtprob.physical.multi_access.changing import ChangingNetwork, changing_network
+from tests.refused_actions import NO_ACTIONS, check_refused
 
 PAIRS = ((0, 1), (2, 3))
 
@@ -90,16 +91,11 @@ def test_without_a_seed_each_network_has_luck_of_its_own():
     assert not np.array_equal(*played)
 
 
-@pytest.mark.parametrize("action", [7, -1, 0.9, float("nan"), None, "1"])
+@pytest.mark.parametrize("action", NO_ACTIONS)
 def test_actions_that_there_are_not_are_refused(action):
     network = changing_network()
     network.reset(seed=1)
-    everyone = dict.fromkeys(network.agents, np.int64(1))
-    with pytest.raises(InputError, match=r"action of device_0: expected 0 \(silent\) or 1 \(sends\)"):
-        network.step({**everyone, "device_0": action})
-    with pytest.raises(InputError, match="one of 'device_9'"):
-        network.step({**everyone, "device_9": 1})
-    assert network.step(everyone)[0]["device_0"][3] == 1
+    check_refused(network, action)
 
 
 def test_devices_sample_actions_of_their_own():

@@ -8,7 +8,7 @@ import pytest
 
 from dtprob.models.multi_access import priors
 from dtprob.workflow.loop import Twin, advance, begin, connect, load_twin_case
-from dtprob.workflow.loop.foresight import HORIZON, RATE, foresee, shortfall
+from dtprob.workflow.loop.foresight import HORIZON, RATE, foresee, seldom_seen, shortfall
 
 CASE = """
 [model]
@@ -40,11 +40,11 @@ def test_slots_on_rows_seldom_seen_are_counted(case, times, share):
     arrival[0, 0, 3] += 1e12
     reception[2, 0] += times
     state = begin(case)._replace(prior={"log_arrival": arrival, "log_reception": reception})
+    assert seldom_seen(jax.random.key(0), case, state, SENDS) == pytest.approx(share, abs=1e-6)
     found = foresee(jax.random.key(0), case, state, SENDS)
-    assert found.seldom == pytest.approx(share, abs=1e-6)
     mean = (0.5 * 1 + 0.5 * 2) / (1.5 + times)  # deliveries of a slot with two senders
-    error = found.throughput.values.mean(axis=1).std() / np.sqrt(len(found.throughput.values))
-    assert abs(found.throughput.mean - mean * (HORIZON - 1) / HORIZON) < 5 * error
+    error = found.values.mean(axis=1).std() / np.sqrt(len(found.values))
+    assert abs(found.mean - mean * (HORIZON - 1) / HORIZON) < 5 * error
 
 
 def after(case, delivered, foreseen, slots=1000):

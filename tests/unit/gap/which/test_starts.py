@@ -22,7 +22,7 @@ TILT_AND_NOISE, TILT_AND_SHIFT = Pair(("noise", "tilt"), 900.0), Pair(("shift", 
 def end(effects, *, leaves, pairs=(TILT_AND_NOISE, TILT_AND_SHIFT)):
     """A fit with these effects, at which a way ended; noise alone moves no mean."""
     scores = SimpleNamespace(
-        pairs=lambda: pairs,
+        pairs=pairs,
         locating=frozenset({"shift", "tilt", "gain"}),
         log_bayes_factor=np.array([700.0, 500.0]),
     )
@@ -67,7 +67,7 @@ def part(effects, evidence, pairs=()):
     return SimpleNamespace(
         problem=problem,
         fitted=fitted,
-        screening=SimpleNamespace(scores=SimpleNamespace(pairs=lambda: pairs)),
+        screening=SimpleNamespace(scores=SimpleNamespace(pairs=pairs)),
     )
 
 
