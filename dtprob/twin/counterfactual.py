@@ -105,10 +105,17 @@ def average_effect(
         check_policy(arm.kernel or kernel, arm.policy)
     parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
     check_tables(kernel, parameters)
+    for arm in (baseline, alternative):
+        check_tables(arm.kernel or kernel, _changed(arm.change, parameters))
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
 
     arms = (baseline, alternative)
     return Effect(np.asarray(_differences(keys, parameters, kernel, arms, metric, horizon=horizon), float))
+
+
+def _changed(change: Callable[[Parameters], Parameters], parameters: Parameters) -> Parameters:
+    """Shapes of the changed tables, each (draw, ...)."""
+    return jax.eval_shape(jax.vmap(change), parameters)
 
 
 @eqx.filter_jit
@@ -209,6 +216,7 @@ def what_if(
     happened = transitions(episode)
     _check_buffers(kernel, episode)
     check_tables(kernel, parameters)
+    check_tables(kernel, _changed(change, parameters))
 
     keys = jax.random.split(jax.random.fold_in(key, 1), draws)
     slots, could = _replayed(keys, happened, parameters, kernel, policy, change=change)
