@@ -35,17 +35,6 @@ def strongest(paths: PathSet, count: int) -> PathSet:
     return _arranged(paths, order)
 
 
-def share_kept(paths: PathSet, fewer: PathSet) -> Float[np.ndarray, " link"]:
-    """Share of each link's power, path by path, that a smaller path set has kept; 1 where there was none.
-
-    Args:
-        paths: the whole.
-        fewer: what `strongest` made of it.
-    """
-    before, after = _power(paths).sum(axis=1), _power(fewer).sum(axis=1)
-    return np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0)
-
-
 def with_beyond(
     paths: PathSet, name: str, other: PathSet, count: int, *, known: PathSet | None = None
 ) -> PathSet:
