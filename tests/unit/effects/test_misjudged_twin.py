@@ -182,6 +182,18 @@ def test_another_trace_adds_only_what_is_new():
         only(joined, "mor")
 
 
+def test_a_path_that_comes_a_rounding_error_later_is_known():
+    """Also where half a picosecond lies between."""
+    paths, later = plain(small_world.trace()), 1e-12 * np.nextafter(100.5, 101)
+    paths, whole = (
+        eqx.tree_at(lambda p: p.delay, paths, paths.delay.at[0, 0].set(delay))
+        for delay in (1e-12 * np.nextafter(100.5, 100), later)
+    )
+    assert not np.any(only(with_beyond(paths, "again", whole, 4), "again"))
+    moved = eqx.tree_at(lambda p: p.delay, paths, paths.delay.at[0, 0].set(later + 2e-12))
+    assert int(np.sum(np.asarray(only(with_beyond(paths, "again", moved, 4), "again")))) == 1
+
+
 def test_paths_of_other_traces_survive_a_file(tmp_path):
     from dtprob.raytracing import storage
 
