@@ -9,6 +9,7 @@ import pytest
 from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.neighbors import KNeighborsRegressor
 
+from dtprob.errors import InputError
 from dtprob.models.prediction_powered import predictors as predictors_module
 from dtprob.models.prediction_powered.estimate import estimate
 from dtprob.models.prediction_powered.neural import Neural
@@ -47,6 +48,12 @@ def test_no_label_is_predicted_by_who_saw_it(scheme, n, predictors):
     assert sample.n == n
     assert sample.prediction_unlabelled.shape == (150, predictors)
     np.testing.assert_array_equal(sample.prediction, 0)
+
+
+def test_one_label_is_not_split():
+    given = data(n=1)
+    with pytest.raises(InputError, match="2 or more, half of which train, got 1"):
+        train(KEY, "ppi", Ridge(), **given)
 
 
 def test_semi_supervised_trains_on_all_and_erm_on_none():
