@@ -83,7 +83,21 @@ class Line(nn.Module):
         return nn.Dense(1)(x)
 
 
+class Turned(eqx.Module):
+    """A linear module that takes its features in an order of whole numbers."""
+
+    inner: eqx.nn.Linear
+    order: jax.Array
+
+    def __init__(self, key):
+        self.inner, self.order = eqx.nn.Linear(2, 1, key=key), jnp.array([1, 0])
+
+    def __call__(self, x):
+        return self.inner(x[self.order])
+
+
 NETWORKS = {
+    "equinox_with_whole_numbers": lambda: Neural.of_equinox(Turned, steps=800, step_size=0.05, decay=0.0),
     "equinox": lambda: Neural.of_equinox(
         lambda key: eqx.nn.Linear(2, 1, key=key), steps=800, step_size=0.05, decay=0.0
     ),
