@@ -80,7 +80,7 @@ class Steps(Protocol):
 def draw_pool(
     key: PRNGKeyArray, sampler: Sampler, n: int, sites: tuple[str, ...] = SITES
 ) -> dict[str, Float[Array, "draw ..."]]:
-    """Parameters of a kernel for episodes to choose from.
+    """Parameters of a kernel for episodes to choose from, in the precision in use; whole numbers stay whole.
 
     Args:
         key: typed JAX key.
@@ -96,7 +96,12 @@ def draw_pool(
         if site not in found:
             remedy = "Take a posterior of the model that the kernel belongs to"
             raise InputError("sampler", f"draws of {site!r}", f"of {', '.join(found)}", remedy)
-    return {site: jnp.asarray(found[site], jnp.result_type(float)) for site in sites}
+    return {site: _in_precision(found[site]) for site in sites}
+
+
+def _in_precision(value: Any) -> Array:
+    array = jnp.asarray(value)
+    return array.astype(float) if jnp.issubdtype(array.dtype, jnp.floating) else array
 
 
 def rollout(key: PRNGKeyArray, kernel: Steps, parameters: Parameters, policy: Policy, horizon: int) -> Any:
