@@ -5,6 +5,7 @@ import sys
 import time
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
+from pathlib import Path
 
 type Say = Callable[[str], None]
 
@@ -36,7 +37,8 @@ def telling() -> Generator[Say]:
 
 def unread() -> None:
     """Write what is still said on standard output nowhere: its reader has seen enough."""
-    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    with Path(os.devnull).open("wb") as nowhere:
+        os.dup2(nowhere.fileno(), sys.stdout.fileno())
 
 
 def _tell(text: str) -> None:

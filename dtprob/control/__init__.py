@@ -10,10 +10,11 @@ from dtprob.control.coma import COMA
 from dtprob.control.environment import Environment, NetworkReward, Observation, Step
 from dtprob.control.information import Counts, DirichletInformation, SampledInformation
 from dtprob.control.ippo import IPPO
-from dtprob.control.kernel import Kernel, draw_pool
+from dtprob.control.kernel import Kernel
 from dtprob.control.learner import Budget, Learner, Trained, train
 from dtprob.control.policy import FramePolicy, HistoryPolicy, Policy, TablePolicy, aloha, tabulate, tdma
 from dtprob.control.rollout import Stateless, evaluate
+from dtprob.twin.rollout import draw_pool
 
 __all__ = [
     "COMA",

@@ -8,10 +8,12 @@ from jaxtyping import PRNGKeyArray
 from dtprob.control.coma import COMA
 from dtprob.control.environment import Environment
 from dtprob.control.information import Clusters, Counts, DirichletInformation
-from dtprob.control.kernel import Kernel, draw_pool
+from dtprob.control.kernel import Kernel
 from dtprob.control.learner import Budget, train
 from dtprob.control.policy import FramePolicy, TablePolicy, tabulate
 from dtprob.inference.exact import DirichletTables
+from dtprob.models.multi_access.transition import SITES
+from dtprob.twin.rollout import draw_pool
 
 _DRAWS = 1000
 
@@ -38,8 +40,7 @@ def collector(
         budget: of the training.
     """
     first, second, third = jax.random.split(key, 3)
-    names = ("log_arrival", "log_reception")
-    counts = Counts(*(jnp.asarray(known.concentration[name], jnp.result_type(float)) for name in names))
+    counts = Counts(*(jnp.asarray(known.concentration[site], jnp.result_type(float)) for site in SITES))
     reward = DirichletInformation(counts, clusters)
     environment = Environment(kernel, draw_pool(first, known, _DRAWS), slots, reward=reward)
     learner = COMA(scale=1.0, discount=0.98, frame=frame, capacity=kernel.capacity)

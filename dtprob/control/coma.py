@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from dtprob.control.critic import CentralCritic
 from dtprob.control.policy import Memory, choice_entropy, log_chance, unroll_each
-from dtprob.control.returns import counterfactual_advantage, device_returns
+from dtprob.control.returns import counterfactual_advantage, device_returns, taken
 from dtprob.control.rollout import Trajectory
 from dtprob.errors import InputError
 
@@ -134,11 +134,6 @@ class COMA:
 def values(critic: CentralCritic, trajectory: Trajectory) -> Float[Array, "slot environment device choice"]:
     """The critic's values of both actions of every device, others' actions kept."""
     return jax.vmap(jax.vmap(critic))(trajectory.observation, trajectory.action)
-
-
-def taken(value: Float[Array, "*batch choice"], action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """The value of the action taken."""
-    return jnp.where(action > 0, value[..., 1], value[..., 0])
 
 
 def critic_loss(

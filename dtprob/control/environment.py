@@ -111,7 +111,7 @@ class Environment(eqx.Module):
 
     Attributes:
         kernel: the transition.
-        pool: draws of its parameters, each leaf (draw, ...); see `dtprob.control.kernel.draw_pool`.
+        pool: draws of its parameters, each leaf (draw, ...); see `dtprob.control.draw_pool`.
         horizon: slots of an episode.
         redraw: slots after which other parameters are drawn within an episode; the horizon means never.
         reward: what is rewarded.

@@ -5,18 +5,11 @@ them is a `dtprob.inference.Sampler`.
 """
 
 from collections.abc import Mapping
-from typing import Any, Final, Protocol
+from typing import Any, Protocol
 
-import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from dtprob.errors import unknown_name
-from dtprob.inference.posterior import Sampler
-
 type Parameters = Mapping[str, Float[Array, "..."]]
-
-SITES: Final = ("log_arrival", "log_reception")
-"""The sites of the multi-access model that its transition takes."""
 
 
 class State(Protocol):
@@ -89,24 +82,3 @@ class Kernel(Protocol):
     ) -> tuple[Any, Any]:
         """The next `State` and the `Slot`."""
         ...
-
-
-def draw_pool(
-    key: PRNGKeyArray, sampler: Sampler, n: int, sites: tuple[str, ...] = SITES
-) -> dict[str, Float[Array, "draw ..."]]:
-    """Parameters for an environment to choose from.
-
-    Args:
-        key: typed JAX key.
-        sampler: posterior, point estimate or ground truth.
-        n: how many draws.
-        sites: what the transition takes.
-
-    Raises:
-        InputError: the sampler does not know a site.
-    """
-    drawn = sampler.sample(key, n)
-    for site in sites:
-        if site not in drawn:
-            raise unknown_name("parameters of the transition", site, drawn, "site")
-    return {site: jnp.asarray(drawn[site], jnp.result_type(float)) for site in sites}

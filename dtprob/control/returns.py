@@ -51,6 +51,11 @@ def device_returns(
     return every(reward, value, truncated, discount, mix), ~truncated.at[-1].set(True)
 
 
+def taken(value: Float[Array, "*batch choice"], action: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The value of the action taken."""
+    return jnp.where(action > 0, value[..., 1], value[..., 0])
+
+
 def counterfactual_advantage(
     value: Float[Array, "*batch choice"], logit: Float[Array, "*batch"], action: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
@@ -63,7 +68,7 @@ def counterfactual_advantage(
     """
     chance = jax.nn.sigmoid(logit)
     average = (1 - chance) * value[..., 0] + chance * value[..., 1]
-    return jnp.where(action > 0, value[..., 1], value[..., 0]) - average
+    return taken(value, action) - average
 
 
 def normalised(

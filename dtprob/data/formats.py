@@ -53,9 +53,8 @@ def load_arrays(path: Path) -> Arrays:
     except InputError:
         raise
     except ImportError as error:
-        raise InputError(
-            str(path), "a format that can be read here", str(error), _REMEDY[path.suffix]
-        ) from error
+        remedy = _EXTRA.get(path.suffix.lower(), "Install dtprob again, with all that it needs")
+        raise InputError(str(path), "a format that can be read here", str(error), remedy) from error
     except Exception as error:
         reason = str(error).split("\n", maxsplit=1)[0].rstrip(".") or type(error).__name__
         raise InputError(
@@ -67,7 +66,8 @@ def load_arrays(path: Path) -> Arrays:
 
 
 _UNNAMED = "column without a name, the {}th from 0"
-_REMEDY = {".zarr": "Install it with: pip install 'dtprob[zarr]'"}
+_EXTRA = {".zarr": "Install it with: pip install 'dtprob[zarr]'"}
+"""What brings the package that a format needs, of formats whose package does not come along."""
 
 
 def _refuse_objects(path: Path, name: str) -> InputError:

@@ -33,6 +33,7 @@ from typing import Literal, final
 
 import numpy as np
 from jaxtyping import Bool, Complex, Float
+from scipy.constants import speed_of_light
 
 from dtprob.data.alignment import Alignment, align, weighted_mean
 from dtprob.data.kinds import ChannelData
@@ -41,7 +42,6 @@ from dtprob.errors import InputError
 
 NAME = "uwb_apartment"
 RESPONSES = "uwb_apartment_cir.npz"
-SPEED_OF_LIGHT = 299_792_458.0
 _REACH_TAPS = 8.0
 
 
@@ -238,5 +238,5 @@ def _averages(
     blocks = np.array_split(np.arange(len(found.gain)), averages)
     means = np.stack([weighted_mean(found.aligned[block], found.gain[block]) for block in blocks])
     means = means / np.sqrt(np.mean(np.abs(means.mean(axis=0)) ** 2))
-    flight = link.ranged_distance / SPEED_OF_LIGHT
+    flight = link.ranged_distance / speed_of_light
     return means * np.exp(-2j * np.pi * frequency * flight)

@@ -165,10 +165,10 @@ class SVI(AbstractEngine):
         return "full_rank" if target.linear.size <= _LARGEST_FULL else "low_rank"
 
     def _steps(self, target: Target, family: Family, inputs: Inputs, key: PRNGKeyArray) -> Steps[Ascent]:
-        search_key, step_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 1)
+        step_key = jax.random.fold_in(key, 1)
 
         def begin() -> Ascent:
-            anchor = self._anchor(target, family, inputs, search_key)
+            anchor = self._anchor(target, family, inputs, key)
             guide = initial_guide(target, family, self.rank)
             nothing = jnp.full(_PATIENCE + 1, -jnp.inf)
             falls = jnp.zeros((), dtype=int)
@@ -195,10 +195,11 @@ class SVI(AbstractEngine):
 
     def _anchor(self, target: Target, family: Family, inputs: Inputs, key: PRNGKeyArray) -> Anchor:
         """The better one of the mode with its curvature and the prior."""
+        search_key, trial_key = jax.random.fold_in(key, 0), jax.random.fold_in(key, 3)
         mode = find_mode(
             target,
             inputs,
-            key,
+            search_key,
             objective="density",
             initial=self.initial,
             starts=self.starts,
@@ -207,7 +208,7 @@ class SVI(AbstractEngine):
         at_mode = target.compiled(anchor_at, family)(mode.optimum.position, inputs)
         at_prior = prior_anchor(target, at_mode)
         bound = target.compiled(_bound, family, self.rank)
-        keys = jax.random.split(key, _TRIALS)
+        keys = jax.random.split(trial_key, _TRIALS)
         heights = [bound(anchor, keys, inputs) for anchor in (at_mode, at_prior)]
         return at_prior if heights[1] > heights[0] else at_mode
 

@@ -19,7 +19,7 @@ from dtprob.physical.impairment import Impairment, Tracer, thermal
 from dtprob.physical.propagation import phase_error
 from dtprob.physical.rays import Rays
 from dtprob.physical.tracing import object_classes, scene_materials
-from dtprob.physical.world import Material, World, planar_array, set_materials
+from dtprob.physical.world import SPEED_OF_LIGHT, Material, World, planar_array, set_materials
 from dtprob.raytracing.paths import PathSet
 from dtprob.raytracing.trace import load_scene
 from dtprob.raytracing.trace import trace as trace_twin
@@ -152,7 +152,7 @@ def place(rng: np.random.Generator, plan: Plan, tracer: Tracer) -> tuple[World, 
     Raises:
         InputError: the street has too few places with three or more paths.
     """
-    half = 299_792_458.0 / plan.frequency / 2
+    half = SPEED_OF_LIGHT / plan.frequency / 2
     west, east, south, north = plan.street
     for _ in range(20):
         tx = [rng.uniform(west / 2, east / 2), rng.uniform(south, north), rng.uniform(3, 10)]

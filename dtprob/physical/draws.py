@@ -216,7 +216,7 @@ def _imbalance(rng: np.random.Generator, setting: Setting) -> Impairment | None:
     return disturbances.noise_imbalance(rng.standard_normal(count)) if count > 1 else None
 
 
-def _walk(setting: Setting, rng: np.random.Generator) -> Float[np.ndarray, "link snapshot sample"]:
+def _walk(rng: np.random.Generator, setting: Setting) -> Float[np.ndarray, "link snapshot sample"]:
     sounding = setting.sounding
     shape = (setting.world.n_link, len(sounding.snapshot_time), len(sounding.subcarrier_frequency))
     return rng.standard_normal(shape)
@@ -267,8 +267,8 @@ FAMILIES: Final[dict[str, Draw]] = {
     ),
     "gain_offset": lambda _rng, _: front_end.gain_offset(),
     "gain_drift": _over_time(lambda _rng, setting: front_end.gain_drift(2 * setting.interval)),
-    "phase_noise": lambda rng, setting: front_end.phase_noise(_walk(setting, rng), 1e5),
-    "carrier_phase_drift": lambda rng, setting: front_end.carrier_phase_drift(_walk(setting, rng)),
+    "phase_noise": lambda rng, setting: front_end.phase_noise(_walk(rng, setting), 1e5),
+    "carrier_phase_drift": lambda rng, setting: front_end.carrier_phase_drift(_walk(rng, setting)),
     "quantization": lambda _rng, _: front_end.quantization(),
     "interference": _interference,
     "colored_noise": lambda rng, setting: disturbances.colored_noise(

@@ -16,6 +16,7 @@ from dtprob.errors import InputError, unknown_name
 from dtprob.raytracing import field
 from dtprob.raytracing.paths import DIMENSIONS, PathSet
 
+_SAME_DELAY = 1e-12  # s
 _PER_PATH = tuple(name for name, dims in DIMENSIONS.items() if dims[:2] == ("link", "path"))
 
 
@@ -33,17 +34,6 @@ def strongest(paths: PathSet, count: int) -> PathSet:
         raise InputError("strongest", "1 path per link or more", str(count), "Raise it")
     order = np.argsort(-_power(paths), axis=1, kind="stable")[:, :count]
     return _arranged(paths, order)
-
-
-def share_kept(paths: PathSet, fewer: PathSet) -> Float[np.ndarray, " link"]:
-    """Share of each link's power, path by path, that a smaller path set has kept; 1 where there was none.
-
-    Args:
-        paths: the whole.
-        fewer: what `strongest` made of it.
-    """
-    before, after = _power(paths).sum(axis=1), _power(fewer).sum(axis=1)
-    return np.where(before > 0, after / np.where(before > 0, before, 1.0), 1.0)
 
 
 def with_beyond(
@@ -134,19 +124,21 @@ def _deep(name: str, first: Array, second: Array) -> list[Array]:
 
 
 def _known(paths: PathSet, other: PathSet) -> Bool[np.ndarray, "link path"]:
-    """Which paths of the other trace the twin has: the same delay, to 1 ps, by the same objects."""
+    """Which paths of the other trace the twin has: by the same objects, and as late within 1 ps."""
     found = np.zeros(other.mask.shape, bool)
+    there, own_delay, delay = (np.asarray(x) for x in (paths.mask, paths.delay, other.delay))
     for link in range(other.n_link):
-        own = {_signature(paths, link, int(p)) for p in np.flatnonzero(np.asarray(paths.mask)[link])}
-        found[link] = [_signature(other, link, p) in own for p in range(other.n_path)]
+        own: dict[tuple[int, ...], list[float]] = {}
+        for path in np.flatnonzero(there[link]):
+            own.setdefault(_course(paths, link, int(path)), []).append(own_delay[link, path])
+        for path in range(other.n_path):
+            alike = np.asarray(own.get(_course(other, link, path), []))
+            found[link, path] = np.any(np.abs(alike - delay[link, path]) <= _SAME_DELAY)
     return found
 
 
-def _signature(paths: PathSet, link: int, path: int) -> tuple[Any, ...]:
+def _course(paths: PathSet, link: int, path: int) -> tuple[int, ...]:
+    """What a path meets, and how."""
     code = np.asarray(paths.interaction)[link, path]
     met = np.asarray(paths.object)[link, path][code != 0]
-    return (
-        *code[code != 0].tolist(),
-        *met.tolist(),
-        round(float(np.asarray(paths.delay)[link, path]) * 1e12),
-    )
+    return (*code[code != 0].tolist(), *met.tolist())

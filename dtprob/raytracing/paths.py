@@ -6,6 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float, Int, Shaped
+from scipy.constants import speed_of_light
 
 from dtprob.errors import InputError
 
@@ -126,7 +127,7 @@ class PathSet(eqx.Module):
     @property
     def wavelength(self) -> float:
         """Wavelength of the carrier in m."""
-        return 299_792_458.0 / self.frequency
+        return speed_of_light / self.frequency
 
     def take(self, links: Int[Any, " chosen"]) -> "PathSet":
         """The path set of some links, in the order given; objects and materials stay.

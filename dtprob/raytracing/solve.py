@@ -9,6 +9,7 @@ from typing import Any, Final, NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from dtprob.errors import InputError
 from dtprob.raytracing.candidates import CandidateCount, large_table
 from dtprob.raytracing.sionna_patch import repaired_sionna
 
@@ -60,7 +61,13 @@ class Objects(NamedTuple):
 
 
 def describe_objects(scene: Any) -> Objects:
-    """Read names, materials and the normals of all faces from a loaded scene."""
+    """Read names, materials and the normals of all faces from a loaded scene.
+
+    Raises:
+        InputError: a scene without objects.
+    """
+    if not scene.objects:
+        raise InputError("scene", "an object or more", "none", "Add one, such as the ground")
     digest = hashlib.sha256()
     names, normals, values, used, centres = [], [], [], [], []
     for name, item in scene.objects.items():
@@ -73,7 +80,7 @@ def describe_objects(scene: Any) -> Objects:
         used.append(item.radio_material.name)
         for part in (name.encode(), used[-1].encode(), corners.tobytes(), faces.tobytes()):
             digest.update(len(part).to_bytes(8, "little") + part)
-    table = np.asarray(values, np.float64).reshape(len(names), len(_PROPERTIES))
+    table = np.asarray(values, np.float64)
     digest.update(table.tobytes())
     materials = tuple(sorted(set(used)))
     return Objects(
@@ -85,9 +92,9 @@ def describe_objects(scene: Any) -> Objects:
         table[:, 1],
         table[:, 2],
         table[:, 3],
-        np.asarray(centres, np.float64).reshape(-1, 3),
+        np.asarray(centres, np.float64),
         np.cumsum([0, *map(len, normals)])[:-1],
-        np.concatenate(normals) if normals else np.zeros((0, 3)),
+        np.concatenate(normals),
         digest.hexdigest(),
     )
 

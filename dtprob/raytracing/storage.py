@@ -80,15 +80,6 @@ def load(file: str | os.PathLike[str]) -> PathSet:
     return validate(PathSet(**arrays, **_described(path, data)))
 
 
-def is_path_set(file: str | os.PathLike[str]) -> bool:
-    """Whether a file is a NetCDF file that says it is a path set."""
-    try:
-        with xr.open_dataset(file, engine="h5netcdf") as opened:
-            return opened.attrs.get("format") == FORMAT
-    except (OSError, ValueError):
-        return False
-
-
 def _check_format(path: Path, data: xr.Dataset) -> None:
     if data.attrs.get("format") != FORMAT:
         got = f"format '{data.attrs.get('format', 'none')}'"

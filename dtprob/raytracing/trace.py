@@ -127,7 +127,8 @@ def trace(
 
     Raises:
         InputError: a link without a path, an end inside a wall, wrong positions, an unknown pattern, an unsupported
-            interaction, a scene whose carrier was changed after its materials were fixed, or one 17 km from the origin.
+            interaction, a scene without objects, one whose carrier was changed after its materials were fixed, or one
+            17 km from the origin.
     """
     tx, rx = _positions("tx_position", tx_position), _positions("rx_position", rx_position)
     _check_request(tx, rx, max_depth, samples, diffraction=diffraction, diffuse_reflection=diffuse_reflection)

@@ -47,7 +47,7 @@ TRANSMITTER: Final = (8.5, 21.0, 27.0)
 RECEIVER: Final = (-20.0, 70.0, 1.5)
 """Of the calibration, behind a corner: every path is reflected."""
 TRUE: Final = Material(5.31, 0.139, 10.0)
-"""Concrete at 6 GHz, ITU-R P.2040."""
+"""Concrete at 6 GHz, ITU-R P.2040-1."""
 TESTS: Final = 20
 """Receivers in the streets around the transmitter, which calibration has not seen."""
 TEST_RAYS: Final = 200_000

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
+from scipy.constants import speed_of_light
 
 from dtprob.errors import InputError
 from dtprob.raytracing.geometry import unfold
@@ -12,7 +13,6 @@ from dtprob.raytracing.paths import NONE, SPECULAR, PathSet, validate
 
 SIZE = np.asarray([9.0, 7.0, 3.2])
 """Length, width and height, m."""
-_SPEED = 299_792_458.0
 _NAMES = ("west", "east", "south", "north", "floor", "ceiling")
 _UP = np.asarray([0.1, 0.2, 1.0])
 # The planes met by each path: line of sight, then west, north, floor, east, south, then corners.
@@ -64,8 +64,8 @@ def room_paths(
     arrival, departure = (way.reshape(links, paths, 3) for way in (found.arrival, found.departure))
     return validate(
         PathSet(
-            delay=jnp.asarray(length / _SPEED),
-            carrier_phasor=jnp.exp(-2j * np.pi * np.mod(frequency * length / _SPEED, 1.0)),
+            delay=jnp.asarray(length / speed_of_light),
+            carrier_phasor=jnp.exp(-2j * np.pi * np.mod(frequency * length / speed_of_light, 1.0)),
             departure=jnp.asarray(departure),
             arrival=jnp.asarray(arrival),
             mask=jnp.ones((links, paths), bool),

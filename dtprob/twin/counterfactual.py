@@ -19,11 +19,9 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 from dtprob.errors import InputError
 from dtprob.inference.posterior import Sampler
 from dtprob.models.multi_access.abduction import Transition, abduct
-from dtprob.models.multi_access.transition import Kernel, State
-from dtprob.twin.predict import Prediction, check_counts, check_tables, sampled
-from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, rollout
-
-SITES = ("log_arrival", "log_reception")
+from dtprob.models.multi_access.transition import SITES, Kernel, State
+from dtprob.twin.predict import Prediction, check_counts, check_tables
+from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, draw_pool, rollout
 
 
 def unchanged(parameters: Parameters) -> Parameters:
@@ -103,12 +101,19 @@ def average_effect(
     check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
     for arm in (baseline, alternative):
         check_policy(arm.kernel or kernel, arm.policy)
-    parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
+    parameters = draw_pool(jax.random.fold_in(key, 0), sampler, draws, sites)
     check_tables(kernel, parameters)
+    for arm in (baseline, alternative):
+        check_tables(arm.kernel or kernel, _changed(arm.change, parameters))
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
 
     arms = (baseline, alternative)
     return Effect(np.asarray(_differences(keys, parameters, kernel, arms, metric, horizon=horizon), float))
+
+
+def _changed(change: Callable[[Parameters], Parameters], parameters: Parameters) -> Parameters:
+    """Shapes of the changed tables, each (draw, ...)."""
+    return jax.eval_shape(jax.vmap(change), parameters)
 
 
 @eqx.filter_jit
@@ -205,10 +210,11 @@ def what_if(
     check_counts({"draws": (draws, 1)})
     if policy is not None:
         check_policy(kernel, policy)
-    parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, SITES)
+    parameters = draw_pool(jax.random.fold_in(key, 0), sampler, draws)
     happened = transitions(episode)
     _check_buffers(kernel, episode)
     check_tables(kernel, parameters)
+    check_tables(kernel, _changed(change, parameters))
 
     keys = jax.random.split(jax.random.fold_in(key, 1), draws)
     slots, could = _replayed(keys, happened, parameters, kernel, policy, change=change)

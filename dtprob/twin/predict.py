@@ -8,14 +8,13 @@ from typing import final
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from dtprob.errors import InputError
 from dtprob.inference.posterior import Sampler
-from dtprob.models.multi_access.transition import Kernel
-from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, rollout
+from dtprob.models.multi_access.transition import SITES, Kernel
+from dtprob.twin.rollout import Metric, Parameters, Policy, Steps, check_policy, draw_pool, rollout
 
 
 @final
@@ -79,7 +78,7 @@ def predict(
     horizon: int,
     draws: int = 200,
     episodes: int = 20,
-    sites: tuple[str, ...] = ("log_arrival", "log_reception"),
+    sites: tuple[str, ...] = SITES,
 ) -> Prediction:
     """Foresee a metric of episodes from the start, under a policy.
 
@@ -100,7 +99,7 @@ def predict(
     """
     check_counts({"horizon": (horizon, 1), "draws": (draws, 1), "episodes": (episodes, 2)})
     check_policy(kernel, policy)
-    parameters = sampled(jax.random.fold_in(key, 0), sampler, draws, sites)
+    parameters = draw_pool(jax.random.fold_in(key, 0), sampler, draws, sites)
     check_tables(kernel, parameters)
     keys = jax.random.split(jax.random.fold_in(key, 1), (draws, episodes))
     return Prediction(np.asarray(_values(keys, parameters, kernel, policy, metric, horizon=horizon), float))
@@ -116,20 +115,6 @@ def _values(
         return metric(rollout(key, kernel, chosen, policy, horizon))
 
     return jax.vmap(jax.vmap(one, in_axes=(0, None)))(keys, parameters)
-
-
-def sampled(key: PRNGKeyArray, sampler: Sampler, draws: int, sites: tuple[str, ...]) -> dict[str, Array]:
-    """The sites of a sampler's draws that a kernel takes.
-
-    Raises:
-        InputError: the sampler lacks one.
-    """
-    found = sampler.sample(key, draws)
-    for site in sites:
-        if site not in found:
-            remedy = "Take a posterior of the model that the kernel belongs to"
-            raise InputError("sampler", f"draws of {site!r}", f"of {', '.join(found)}", remedy)
-    return {site: jnp.asarray(found[site]) for site in sites}
 
 
 def check_tables(kernel: Steps, parameters: Parameters) -> None:

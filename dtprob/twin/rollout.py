@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from dtprob.errors import InputError
+from dtprob.inference.posterior import Sampler
+from dtprob.models.multi_access.transition import SITES
 
 type Parameters = Mapping[str, Array]
 type Policy = Callable[[PRNGKeyArray, Any], Int[Array, " device"]]
@@ -73,6 +75,33 @@ class Steps(Protocol):
     ) -> tuple[Any, Any]:
         """One slot: the next state, and what happened."""
         ...
+
+
+def draw_pool(
+    key: PRNGKeyArray, sampler: Sampler, n: int, sites: tuple[str, ...] = SITES
+) -> dict[str, Float[Array, "draw ..."]]:
+    """Parameters of a kernel for episodes to choose from, in the precision in use; whole numbers stay whole.
+
+    Args:
+        key: typed JAX key.
+        sampler: posterior, point estimate or ground truth.
+        n: how many draws.
+        sites: the parameters that the kernel takes.
+
+    Raises:
+        InputError: the sampler lacks one.
+    """
+    found = sampler.sample(key, n)
+    for site in sites:
+        if site not in found:
+            remedy = "Take a posterior of the model that the kernel belongs to"
+            raise InputError("sampler", f"draws of {site!r}", f"of {', '.join(found)}", remedy)
+    return {site: _in_precision(found[site]) for site in sites}
+
+
+def _in_precision(value: Any) -> Array:
+    array = jnp.asarray(value)
+    return array.astype(float) if jnp.issubdtype(array.dtype, jnp.floating) else array
 
 
 def rollout(key: PRNGKeyArray, kernel: Steps, parameters: Parameters, policy: Policy, horizon: int) -> Any:

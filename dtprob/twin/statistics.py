@@ -106,7 +106,8 @@ def p_value(
 def detector(evidence: Float[np.ndarray, "... window"], axis: int = -1) -> Float[np.ndarray, "... window"]:
     """Log of the Shiryaev-Roberts detector R_t = (1 + R_{t-1}) e_t, which forgets no possible time of the change.
 
-    An alarm when it first reaches log(n) has a mean time to a false alarm of n windows or more.
+    An alarm when it first reaches log(n) has a mean time to a false alarm of n windows or more. After a window that
+    cannot be without a change it stays infinite.
 
     Args:
         evidence: log e-value of each window.
@@ -115,7 +116,7 @@ def detector(evidence: Float[np.ndarray, "... window"], axis: int = -1) -> Float
     steps = np.moveaxis(np.asarray(evidence, float), axis, 0)
     path, last = np.empty_like(steps), np.full(steps.shape[1:], -np.inf)
     for i, step in enumerate(steps):
-        last = np.logaddexp(0.0, last) + step
+        last = np.logaddexp(0.0, last) + np.where(np.isposinf(last), np.inf, step)
         path[i] = last
     return np.moveaxis(path, 0, axis)
 

@@ -45,14 +45,14 @@ def coded(file: Path, columns: Mapping[str, Any], words: Words, taken: Collectio
         elif is_text and name in taken and _has_commas(text):
             remedy = "Write points in numbers, and leave out what separates thousands"
             raise InputError(
-                f"{file.name}, column {name!r}", "numbers", f"words ({str(text[0])!r} first)", remedy
+                f"{file.name}, column {name!r}", "numbers", f"words ({str(text.flat[0])!r} first)", remedy
             )
         elif is_text and name in taken and _are_names(text):
-            found = sorted(set(text.tolist()))
+            found = sorted(set(text.reshape(-1).tolist()))
             listed = ", ".join(f'"{word}"' for word in found)
             remedy = f"Number its words in the CASE: [data.words] {name} = [{listed}]"
             raise InputError(
-                f"{file.name}, column {name!r}", "numbers", f"words ({str(text[0])!r} first)", remedy
+                f"{file.name}, column {name!r}", "numbers", f"words ({str(text.flat[0])!r} first)", remedy
             )
     return result
 
@@ -95,15 +95,17 @@ def spelled(report: Mapping[str, Any], words: Words) -> dict[str, Any]:
 
 def _numbers(file: Path, name: str, text: np.ndarray, listed: Sequence[str]) -> np.ndarray:
     number = {word: k for k, word in enumerate(listed)}
-    for row, word in enumerate(text.tolist()):
+    every = text.reshape(-1).tolist()
+    for place, word in zip(np.ndindex(np.atleast_1d(text).shape), every, strict=True):
         if word not in number:
+            row = ", ".join(map(str, place))
             close = nearest(word, listed)
             remedy = (
                 f"Did you mean {close!r}?" if close else f"Correct it, or add it to {name} in [data.words]"
             )
             expected = f"one of {', '.join(listed)}"
             raise InputError(f"{file.name}, column {name!r}, row {row}", expected, repr(word), remedy)
-    return np.array([number[word] for word in text.tolist()])
+    return np.reshape([number[word] for word in every], text.shape)
 
 
 def _has_commas(text: np.ndarray) -> bool:
@@ -114,9 +116,9 @@ def _has_commas(text: np.ndarray) -> bool:
 
 def _are_names(text: np.ndarray) -> bool:
     """Whether words are so few that a list of them is what is wanted, and neither numbers nor points in time."""
-    found = set(text.tolist())
+    found = set(text.reshape(-1).tolist())
     is_name = (word and not is_number(word) and not _TIME.match(word) for word in found)
-    return text.ndim == 1 and 0 < len(found) <= _MOST and all(is_name)
+    return text.ndim > 0 and 0 < len(found) <= _MOST and all(is_name)
 
 
 def _with_words(entry: Mapping[str, Any], words: Words) -> dict[str, Any]:

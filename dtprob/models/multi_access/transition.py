@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple, final
+from typing import Final, NamedTuple, final
 
 import equinox as eqx
 import jax
@@ -20,6 +20,9 @@ from dtprob.models.multi_access.clusters import Clusters
 
 type Parameters = Mapping[str, Array]
 """`log_arrival` (cluster, previous, outcome) and `log_reception` (sender_count, delivery_count)."""
+
+SITES: Final = ("log_arrival", "log_reception")
+"""The sites of the model that a slot takes."""
 
 
 class State(NamedTuple):

@@ -233,10 +233,12 @@ def _with_p_value(region: Region, p_value: float) -> Region:
 
 
 def _slope(prediction: np.ndarray, y: np.ndarray, level: float) -> tuple[Range, float]:
-    if np.ptp(prediction) == 0:
+    """Slope of the labels in the predictions, and the p-value of 1; nothing is known from fewer than three labels."""
+    degrees = len(y) - 2
+    if np.ptp(prediction) == 0 or degrees < 1:
         return Range(1.0, -np.inf, np.inf), 1.0
     fit: Any = stats.linregress(prediction, y)
-    slope, error, degrees = float(fit.slope), float(fit.stderr), len(y) - 2
+    slope, error = float(fit.slope), float(fit.stderr)
     half = float(stats.t.ppf((1 + level) / 2, degrees)) * error
     p_value = float(2 * stats.t.sf(abs(slope - 1) / error, degrees)) if error > 0 else float(slope == 1)
     return Range(slope, slope - half, slope + half), p_value

@@ -39,15 +39,15 @@ class Neural(JaxPredictor):
     def of_equinox(cls, build: Callable[[PRNGKeyArray], Any], **settings: Any) -> Self:
         """From a function that builds an Equinox module for one sample from a key.
 
-        A module that gives outputs of shape (1,) predicts scalar labels.
+        A module that gives outputs of shape (1,) predicts scalar labels. Floating-point arrays are trained; whole numbers
+        and the like are those of one key for all folds.
         """
 
         def init(key: PRNGKeyArray, x: Array) -> Any:
             del x
             return eqx.filter(build(key), eqx.is_inexact_array)
 
-        fixed = eqx.filter_eval_shape(build, jax.random.key(0))
-        static = eqx.partition(fixed, lambda leaf: isinstance(leaf, jax.ShapeDtypeStruct))[1]
+        static = eqx.filter(build(jax.random.key(0)), eqx.is_inexact_array, inverse=True)
 
         def apply(parameters: Any, x: Array) -> Array:
             module = eqx.combine(parameters, static)

@@ -63,8 +63,8 @@ def train(
         rest: further fields of `Sample`, such as weights.
 
     Raises:
-        InputError: fewer labels than folds, a fold whose training labels are all of one class, features that
-            do not fit together.
+        InputError: fewer labels than folds, one label to split, a fold whose training labels are all of one class,
+            features that do not fit together.
     """
     chosen = named_scheme(scheme)
     whole = {"features": features, "x_unlabelled": features_unlabelled, **rest}
@@ -75,6 +75,9 @@ def train(
         return _sample(whole, np.arange(len(y)), y, None, None)
     keys = jax.random.split(key)
     if chosen.training == "split":
+        if len(y) < 2:
+            remedy = "Label more samples, or use scheme erm"
+            raise InputError("labelled samples", "2 or more, half of which train", str(len(y)), remedy)
         half = np.asarray(jax.random.permutation(keys[0], len(y)))
         inside = np.zeros(len(y), bool)
         inside[half[: len(y) // 2]] = True

@@ -7,6 +7,7 @@ from jaxtyping import Float, Int
 
 from dtprob.errors import DtprobError, InputError
 from dtprob.physical.multi_access.chain import Chain
+from dtprob.physical.multi_access.kernel import REWARDS
 
 type Rule = Float[np.ndarray, "phase device buffer arrival ack"]
 """Chance that a device with a packet sends, by what it sees; `phase` is the slot modulo the frame."""
@@ -61,7 +62,8 @@ def gains(chain: Chain) -> Gains:
     lost = (chain.buffer == chain.network.capacity) * fills
     overflow = lost @ (1 - subsets).T
     delivered = np.broadcast_to(subsets.sum(axis=1), overflow.shape).astype(float)
-    reward = 50 * delivered - 50 * overflow - (devices - delivered - overflow)
+    rest = devices - delivered - overflow
+    reward = REWARDS.delivered * delivered + REWARDS.overflow * overflow + REWARDS.otherwise * rest
     return Gains(delivered, overflow / devices, reward)
 
 

@@ -31,7 +31,7 @@ class Medium(NamedTuple):
 AIR: Final = Medium(1.0, 0.0)
 METAL: Final = Medium(1.0, math.inf)
 CONCRETE: Final = Medium(5.31, 0.0326 * 6**0.8095)
-"""Concrete at 6 GHz. Source: Recommendation ITU-R P.2040, table 3."""
+"""Concrete at 6 GHz. Source: Recommendation ITU-R P.2040-1 (2015), table 3; later editions have other values."""
 
 
 @dataclass(frozen=True)

@@ -70,6 +70,10 @@ def test_parameters_change_when_they_should(transition):
 def test_a_pool_comes_from_any_sampler():
     pool = draw_pool(jax.random.key(0), PointMass(NETWORK.parameters), 3)
     assert pool["log_reception"].shape == (3, 5, 5)
+    known = {"rate": np.float32(0.5), "place": np.array([2, 0])}
+    kept = draw_pool(jax.random.key(0), PointMass(known), 2, ("rate", "place"))
+    assert kept["rate"].dtype == jnp.result_type(float)
+    assert jnp.issubdtype(kept["place"].dtype, jnp.integer)
     with pytest.raises(InputError, match="log_arrival"):
         draw_pool(jax.random.key(0), PointMass({"log_reception": np.zeros((5, 5))}), 3)
     with pytest.raises(InputError, match="horizon: expected 1 slot or more"):

@@ -2,6 +2,7 @@
 
 import json
 import pickle
+import sys
 
 import h5py
 import numpy as np
@@ -566,3 +567,14 @@ def test_a_table_takes_no_options(tmp_path):
     (tmp_path / "t.csv").write_text("a,b\n1,2\n3,4\n")
     with pytest.raises(InputError, match=r"options of t.csv: expected none, got separator"):
         read_table(tmp_path / "t.csv", {"separator": ";"})
+
+
+@pytest.mark.parametrize(
+    ("name", "told"), [("a.ZARR", "dtprob\\[zarr\\]"), ("a.parquet", "Install dtprob again")]
+)
+def test_a_package_that_is_not_installed_is_named(tmp_path, monkeypatch, name, told):
+    (tmp_path / name).mkdir()
+    for package in ("zarr", "pyarrow.parquet"):
+        monkeypatch.setitem(sys.modules, package, None)
+    with pytest.raises(InputError, match=rf"a format that can be read here, got import of .*{told}"):
+        read_table(tmp_path / name)

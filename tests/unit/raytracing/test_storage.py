@@ -12,7 +12,7 @@ import xarray as xr
 
 from dtprob.errors import InputError
 from dtprob.raytracing.field import path_gain
-from dtprob.raytracing.storage import is_path_set, load, save
+from dtprob.raytracing.storage import load, save
 
 READ = """
 import sys
@@ -77,7 +77,6 @@ def test_an_invalid_set_leaves_the_old_file(box, stored):
 
 
 def test_what_is_no_path_set(stored, tmp_path):
-    assert is_path_set(stored)
     text, other, later, short = (tmp_path / f"{name}.nc" for name in ("text", "other", "later", "short"))
     text.write_text("not a file of this kind")
     xr.Dataset({"x": 1.0}).to_netcdf(other, engine="h5netcdf")
@@ -94,8 +93,6 @@ def test_what_is_no_path_set(stored, tmp_path):
     for file, message in cases.items():
         with pytest.raises(InputError, match=message):
             load(file)
-    assert not is_path_set(text)
-    assert not is_path_set(other)
 
 
 @pytest.mark.parametrize(

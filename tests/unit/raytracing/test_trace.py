@@ -265,6 +265,11 @@ def test_positions_that_make_no_links(street):
             trace(street, tx, rx, samples=1000)
 
 
+def test_a_scene_without_objects_is_refused(rt):
+    with pytest.raises(InputError, match="scene: expected an object or more, got none"):
+        trace(rt.load_scene(), np.array([[0.0, 0.0, 2.0]]), np.array([[9.0, 0.0, 2.0]]))
+
+
 def test_scenes_that_do_not_exist(rt, tmp_path):
     broken = tmp_path / "broken.xml"
     broken.write_text("<scene version='2.1.0'><shape type='rectangle'></scene>")

@@ -13,7 +13,7 @@ from jax.experimental.ode import odeint
 
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.errors import InputError
-from dtprob.inference import AbstractEngine, Laplace
+from dtprob.inference import AbstractEngine, Laplace, Point
 from dtprob.inference.fit import fit
 from dtprob.models.declaration import model
 from dtprob.testing import ContractError, check_effect, check_engine, check_model
@@ -100,6 +100,9 @@ def test_broken_models(broken, message):
         check_model(broken, DATA)
 
 
+USUAL = Laplace(draws=2000)
+
+
 @dataclasses.dataclass(frozen=True)
 class Shifted(AbstractEngine):
     """An engine that is wrong by a little, forgets its key, or compiles for every data set."""
@@ -110,12 +113,13 @@ class Shifted(AbstractEngine):
     shift: float = 0.0
     ignore_key: bool = False
     compile_again: bool = False
+    base: AbstractEngine = USUAL
 
     def __call__(self, key, model, data, **options):
         if self.compile_again:
             jax.jit(lambda: 2 * data["y"])()
         used = jax.random.key(0) if self.ignore_key and isinstance(key, jax.Array) else key
-        posterior = Laplace(draws=2000)(used, model, data, **options)
+        posterior = self.base(used, model, data, **options)
         draws = {
             "level": posterior.draws["level"] + self.shift,
             "doubled": posterior.draws["doubled"] + 2 * self.shift,
@@ -131,6 +135,18 @@ def test_engines():
         check_engine(Shifted(ignore_key=True))
     with pytest.raises(ContractError, match="nothing to compile for other data of known shapes"):
         check_engine(Shifted(compile_again=True))
+
+
+class Turned(Shifted):
+    """An engine with a single value, wrong by a turn where nothing turns."""
+
+    answer: ClassVar[str] = "point"
+
+
+def test_a_turn_is_an_error_of_what_is_no_angle():
+    check_engine(Turned(base=Point()))
+    with pytest.raises(ContractError, match="the mode"):
+        check_engine(Turned(base=Point(), shift=2 * np.pi))
 
 
 def offset(**changes):

@@ -110,6 +110,25 @@ def test_the_effect_of_another_network(posterior):
     assert found.interval()[0] > 0.2
 
 
+def test_a_change_to_tables_of_another_network_is_refused(log, posterior):
+    """Rows that a smaller table lacks would be clamped to its last, without a word."""
+
+    def smaller(parameters):
+        return {**parameters, "log_reception": parameters["log_reception"][:3, :3]}
+
+    arm, larger = Arm(random_access(4, 0.3)), kernel([[0, 1], [2, 3], [4, 5]])
+    changed = arm._replace(change=smaller), "draws of 'log_reception'"
+    replaced = Arm(random_access(6, 0.3), kernel=larger), "draws of 'log_arrival'"
+    for other, told in (changed, replaced):
+        with pytest.raises(InputError, match=told):
+            average_effect(
+                jax.random.key(0), SYSTEM, posterior, baseline=arm, alternative=other,
+                metric=throughput, horizon=5, draws=2, episodes=2,
+            )  # fmt: skip
+    with pytest.raises(InputError, match="draws of 'log_reception'"):
+        what_if(jax.random.key(0), SYSTEM, posterior, log, change=smaller, draws=2)
+
+
 def test_transitions_carry_the_slot_before(log):
     happened = transitions(log)
     assert np.array_equal(happened.state.ack[1:], log.ack[:-1])

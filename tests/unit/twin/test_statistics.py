@@ -91,6 +91,13 @@ def test_windows_that_cannot_be_are_changes():
     np.testing.assert_array_equal(statistics.log_evidence(nothing, learned), [-np.inf, -np.inf, np.inf])
 
 
+def test_a_certain_change_stays_certain():
+    """Whatever comes after a window that cannot be without a change, also one that cannot be with it."""
+    evidence = np.array([[0.1, np.inf, -np.inf, 0.3], [0.1, -np.inf, 0.0, np.log(2)]])
+    expected = [[0.1, np.inf, np.inf, np.inf], [0.1, -np.inf, 0.0, np.log(4)]]
+    np.testing.assert_allclose(statistics.detector(evidence), expected)
+
+
 def test_a_factor_that_changed_for_sure_is_the_one_that_is_blamed():
     """Its evidence has no bound in a window that cannot be under what was learned."""
     evidence = {"arrivals": np.array([0.3, -1.0]), "reception": np.array([0.1, np.inf])}

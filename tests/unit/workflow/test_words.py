@@ -14,7 +14,7 @@ from dtprob.case import Case, load_case
 from dtprob.commands.diagnose import run
 from dtprob.errors import InputError
 from dtprob.workflow import prepare
-from dtprob.workflow.words import spelled
+from dtprob.workflow.words import coded, spelled
 
 MODEL = """import numpyro
 import numpyro.distributions as dist
@@ -97,6 +97,23 @@ def test_what_is_wrong_is_said_with_what_to_do(tmp_path, rows, more, told):
     with pytest.raises(InputError) as caught:
         prepare(case(tmp_path, rows=rows, more=more), need="fit")
     assert re.search(told, str(caught.value)), str(caught.value)
+
+
+def test_words_may_lie_in_several_dimensions():
+    """As an NPZ file can hold them."""
+    table, file = {"site": np.array([["harbour", "tower"], ["tower", "quay"]])}, Path("t.npz")
+    listed = {"site": (*SITES, "quay")}
+    assert_array_equal(coded(file, table, listed, ["site"])["site"], [[0, 2], [2, 3]])
+    with pytest.raises(InputError, match=r"column 'site', row 1, 1: expected one of .*, got 'quay'"):
+        coded(file, table, {"site": SITES}, ["site"])
+    with pytest.raises(InputError, match=r'first.*Number its words .* site = ."harbour", "quay", "tower"'):
+        coded(file, table, {}, ["site"])
+
+
+def test_a_single_word_is_no_list_of_letters():
+    table, file = {"season": np.array("dry")}, Path("t.npz")
+    assert coded(file, table, {"season": ("wet", "dry")}, ["season"])["season"] == 1
+    assert coded(file, table, {}, ["season"])["season"] == "dry"
 
 
 def test_names_may_begin_with_a_digit(tmp_path):

@@ -56,6 +56,14 @@ def test_a_timid_predictor_shows_in_the_scale():
     assert found.scale_p_value < 1e-6
 
 
+def test_two_labels_tell_nothing_of_the_scale():
+    """A line goes through any two, and has no error."""
+    two = Sample(x=np.array([[0.0], [1.0]]), y=np.array([1.0, 2.0]), prediction=np.array([0.5, 3.0]))
+    found = bias_map(two)
+    assert found.scale == (1.0, -np.inf, np.inf)
+    assert found.scale_p_value == 1.0
+
+
 def test_a_moved_feature_is_named():
     found = bias_map(mapped(moved=0.6))
     assert found.shifted_feature == 1

@@ -9,6 +9,7 @@ import pytest
 from sklearn.linear_model import LinearRegression, LogisticRegression
 from sklearn.neighbors import KNeighborsRegressor
 
+from dtprob.errors import InputError
 from dtprob.models.prediction_powered import predictors as predictors_module
 from dtprob.models.prediction_powered.estimate import estimate
 from dtprob.models.prediction_powered.neural import Neural
@@ -49,6 +50,12 @@ def test_no_label_is_predicted_by_who_saw_it(scheme, n, predictors):
     np.testing.assert_array_equal(sample.prediction, 0)
 
 
+def test_one_label_is_not_split():
+    given = data(n=1)
+    with pytest.raises(InputError, match="2 or more, half of which train, got 1"):
+        train(KEY, "ppi", Ridge(), **given)
+
+
 def test_semi_supervised_trains_on_all_and_erm_on_none():
     np.testing.assert_array_equal(train(KEY, "ss", Memory(), **data()).prediction, 1)
     alone = train(KEY, "erm", Memory(), **data())
@@ -76,7 +83,21 @@ class Line(nn.Module):
         return nn.Dense(1)(x)
 
 
+class Turned(eqx.Module):
+    """A linear module that takes its features in an order of whole numbers."""
+
+    inner: eqx.nn.Linear
+    order: jax.Array
+
+    def __init__(self, key):
+        self.inner, self.order = eqx.nn.Linear(2, 1, key=key), jnp.array([1, 0])
+
+    def __call__(self, x):
+        return self.inner(x[self.order])
+
+
 NETWORKS = {
+    "equinox_with_whole_numbers": lambda: Neural.of_equinox(Turned, steps=800, step_size=0.05, decay=0.0),
     "equinox": lambda: Neural.of_equinox(
         lambda key: eqx.nn.Linear(2, 1, key=key), steps=800, step_size=0.05, decay=0.0
     ),
