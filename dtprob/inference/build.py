@@ -150,7 +150,7 @@ def _program(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> st
 
 
 def _make_target(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Target:
-    declaration = declare(model, eqx.combine(arrays, static), factors_will_do=True)
+    declaration = declare(model, eqx.combine(arrays, static), needs="weight")
     shapes = _unconstrained_shapes(model, arrays, static)
     if not declaration.latent:
         remedy = "Sample at least one unknown with numpyro.sample"

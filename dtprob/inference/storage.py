@@ -33,6 +33,8 @@ def to_datatree(posterior: Posterior) -> xr.DataTree:
         "sample_stats": _dataset(posterior.sample_stats, axes, _LEADING, {}),
         "log_likelihood": _dataset(posterior.log_likelihood, axes, _LEADING, posterior.coords),
         "observed_data": _dataset(posterior.observed, axes, (), posterior.coords),
+        "constant_data": _dataset(posterior.constant, axes, (), posterior.coords),
+        "posterior_predictive": _dataset(posterior.predicted, axes, _LEADING, posterior.coords),
         "extra": _dataset(posterior.extra, {}, (), {}),
     }
     filled = {name: dataset for name, dataset in groups.items() if name == "posterior" or dataset.data_vars}
@@ -99,6 +101,8 @@ def from_datatree(tree: xr.DataTree, what: str = "data tree") -> Posterior:
         sample_stats=arrays.get("sample_stats", {}),
         log_likelihood=arrays.get("log_likelihood", {}),
         observed=arrays.get("observed_data", {}),
+        constant=arrays.get("constant_data", {}),
+        predicted=arrays.get("posterior_predictive", {}),
         axes={name: tuple(names) for name, names in json.loads(tree.attrs["axes"]).items()},
         latent=tuple(json.loads(tree.attrs["latent"])),
         circular=tuple(json.loads(tree.attrs["circular"])),

@@ -29,6 +29,7 @@ from dtprob.wrapping import unwrapped
 numpyro.distributions.__dict__["distribution"] = distribution
 
 type Kind = Literal["latent", "deterministic", "observed"]
+type Needs = Literal["observation", "weight", "nothing"]
 
 NOT_TRACED = (
     jax.errors.ConcretizationTypeError,
@@ -250,7 +251,7 @@ class _Names(Messenger):
 
 
 def declare(
-    function: Model, data: Data, *, cluster: str | None = None, factors_will_do: bool = False
+    function: Model, data: Data, *, cluster: str | None = None, needs: Needs = "observation"
 ) -> Declaration:
     """Run the model once, abstractly, and tell its sites and axes.
 
@@ -258,8 +259,8 @@ def declare(
         function: a NumPyro model; its arguments are the data's entries by name.
         data: arrays and settings by argument name; the observed ones present.
         cluster: overrides the model's own cluster axis.
-        factors_will_do: allow a model that observes nothing, but weighs its data by `numpyro.factor`, as a likelihood that
-            is summed by hand over hidden states; all its arguments have to be given.
+        needs: "weight" allows a model that observes nothing, but weighs its data by `numpyro.factor`, as a likelihood that
+            is summed by hand over hidden states, if all its arguments are given; "nothing" one without its data.
 
     Raises:
         InputError: the data do not match the model's arguments, or the model observes nothing.
@@ -306,7 +307,9 @@ def declare(
     declaration = Declaration(
         model_name(function), found, cluster or notes.cluster or _first_plate(found), tuple(factors)
     )
-    _refuse_unobserved(declaration, factors_will_do=factors_will_do and not left_out(function, data))
+    weighs = needs == "weight" and factors and not left_out(function, data)
+    if needs != "nothing" and not weighs:
+        _refuse_unobserved(declaration)
     for name, measure in notes.measures.items():
         if measure.site not in declaration.observed:
             known = ", ".join(declaration.observed)
@@ -315,13 +318,13 @@ def declare(
     return declaration
 
 
-def _refuse_unobserved(declaration: Declaration, *, factors_will_do: bool) -> None:
+def _refuse_unobserved(declaration: Declaration) -> None:
     """Look for what data say.
 
     Raises:
-        InputError: the model observes nothing, and has no factors that will do.
+        InputError: the model observes nothing.
     """
-    if not declaration.observed and not (factors_will_do and declaration.factors):
+    if not declaration.observed:
         raise InputError(
             f"model {declaration.name}",
             "an observed site",
