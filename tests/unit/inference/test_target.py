@@ -381,3 +381,23 @@ def density_of(distance, inputs):
     mean = float(inputs.location[0] + inputs.scale[0])
     terms = stats.norm.logpdf(mean), 2 * stats.norm.logpdf(mean * distance), np.log(float(inputs.scale[0]))
     return sum(terms)
+
+
+def walks(y=None):
+    """A scan within a scan."""
+
+    def inner(before, seen):
+        now = numpyro.sample("state", dist.Normal(before, 1.0))
+        numpyro.sample("y", dist.Normal(now, 1.0), obs=seen)
+        return now, None
+
+    scan(lambda before, seen: (scan(inner, before, seen)[0], None), 0.0, y)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (3, 4)])
+def test_a_scan_within_a_scan_is_refused(shape):
+    """With fewer inner steps than outer ones there was an answer, of a density that was broadcast."""
+    with pytest.raises(
+        InputError, match=r"site 'state': expected latent sites within one scan.*Scan once over all"
+    ):
+        fit(walks, {"y": jnp.ones(shape)}, engine="laplace", key=KEY)
