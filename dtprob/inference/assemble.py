@@ -107,9 +107,14 @@ def constant_data(target: Target, inputs: Inputs) -> dict[str, np.ndarray]:
 
 
 def _axes(declaration: Declaration, constant: Mapping[str, np.ndarray]) -> dict[str, tuple[str, ...]]:
-    """Names of the axes of sites, and of arguments as of what is observed beside them."""
+    """Names of the axes of sites, and of arguments as of what is observed beside them.
+
+    An argument that is called as a plate is has other axes: xarray would take it for the axis' own values.
+    """
     observed = [(site.shape, site.axes) for site in declaration.observed.values()]
-    given = {n: lent(c.shape, unnamed_axes(n, c.ndim), observed) for n, c in constant.items()}
+    own = {n: unnamed_axes(n, c.ndim) for n, c in constant.items()}
+    found = {n: lent(c.shape, own[n], observed) for n, c in constant.items()}
+    given = {n: own[n] if n in axes else axes for n, axes in found.items()}
     return given | {name: site.axes for name, site in declaration.sites.items()}
 
 

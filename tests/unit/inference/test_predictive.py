@@ -94,3 +94,14 @@ def test_what_cannot_be_foreseen_is_refused(fitted):
         predictive(KEY, fitted, other, {"x": X})
     with pytest.raises(InputError, match=r"prediction: expected at most 2e.08 numbers"):
         predictive(KEY, fitted, line, {"x": np.zeros(100_000)})
+
+
+def test_an_argument_may_be_called_as_its_plate_is(tmp_path):
+    def model(row, y=None):
+        slope = numpyro.sample("slope", dist.Normal(0.0, 2.0))
+        with numpyro.plate("row", row.shape[0]):
+            numpyro.sample("y", dist.Normal(slope * row, 0.5), obs=y)
+
+    posterior = fit(model, {"row": X, "y": Y}, engine="laplace", key=KEY, draws=10)
+    posterior.save(tmp_path / "p.nc")
+    np.testing.assert_array_equal(Posterior.load(tmp_path / "p.nc").constant["row"], X)
