@@ -16,6 +16,7 @@ from dtprob.inference.laplace import Laplace
 from dtprob.inference.nuts import NUTS
 from dtprob.inference.point import Point
 from dtprob.inference.posterior import PointMass, Posterior, Sampler
+from dtprob.inference.predictive import predictive
 from dtprob.inference.smc import SMC
 from dtprob.inference.summary import summary
 from dtprob.inference.svi import SVI
@@ -43,6 +44,7 @@ __all__ = [
     "choose",
     "fit",
     "fit_each",
+    "predictive",
     "resolve",
     "summary",
 ]

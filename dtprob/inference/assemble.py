@@ -17,7 +17,8 @@ import dtprob
 from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Evaluation, Inputs, Target
-from dtprob.models.declaration import trace_model
+from dtprob.models.axes import lent, unnamed_axes
+from dtprob.models.declaration import Declaration, trace_model
 
 _BLOCK, _BLOCK_ENTRIES = 32, 2_000_000
 _RECORDED = ("jax", "numpyro", "blackjax")
@@ -55,12 +56,14 @@ def assemble(
     values, pointwise, lp = jax.tree.map(lambda *parts: np.stack(parts), *pushed)
     declaration = target.declaration
     sites = [name for name in declaration.sites if name in values]
+    constant = constant_data(target, inputs)
     return Posterior(
         draws={name: values[name] for name in sites},
         sample_stats=independent_stats(given["lp"] if has_lp else lp) | given,
         log_likelihood=pointwise,
         observed=observed_data(target, inputs),
-        axes={name: site.axes for name, site in declaration.sites.items()},
+        constant=constant,
+        axes=_axes(declaration, constant),
         latent=tuple(target.coordinates),
         circular=tuple(name for name in sites if declaration.sites[name].is_circular),
         extra={name: np.asarray(value) for name, value in (extra or {}).items()},
@@ -94,6 +97,25 @@ def data_hash(inputs: Inputs) -> str:
 def observed_data(target: Target, inputs: Inputs) -> dict[str, np.ndarray]:
     """The data of each observed site."""
     return jax.tree.map(np.asarray, target.compiled(observed_sites)(inputs))
+
+
+def constant_data(target: Target, inputs: Inputs) -> dict[str, np.ndarray]:
+    """The arguments that are arrays and are not observed."""
+    observed = {site.argument for site in target.declaration.observed.values()}
+    columns = {name: entry for name, entry in inputs.arrays.items() if name not in observed}
+    return {name: np.asarray(entry) for name, entry in columns.items() if isinstance(entry, jax.Array)}
+
+
+def _axes(declaration: Declaration, constant: Mapping[str, np.ndarray]) -> dict[str, tuple[str, ...]]:
+    """Names of the axes of sites, and of arguments as of what is observed beside them.
+
+    An argument that is called as a plate is has other axes: xarray would take it for the axis' own values.
+    """
+    observed = [(site.shape, site.axes) for site in declaration.observed.values()]
+    own = {n: unnamed_axes(n, c.ndim) for n, c in constant.items()}
+    found = {n: lent(c.shape, own[n], observed) for n, c in constant.items()}
+    given = {n: own[n] if n in axes else axes for n, axes in found.items()}
+    return given | {name: site.axes for name, site in declaration.sites.items()}
 
 
 def observed_sites(target: Target, inputs: Inputs) -> dict[str, Array]:

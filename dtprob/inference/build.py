@@ -121,7 +121,17 @@ def _signature(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> 
     leaves, structure = jax.tree.flatten(arrays)
     settings, settings_structure = jax.tree.flatten(static)
     shapes = tuple((leaf.shape, str(leaf.dtype)) for leaf in leaves)
-    return model, structure, shapes, settings_structure, tuple(settings), jax.config.jax_enable_x64
+    known = tuple(_hashable(setting) for setting in settings)
+    return model, structure, shapes, settings_structure, known, jax.config.jax_enable_x64
+
+
+def _hashable(setting: Any) -> Any:
+    """A setting, or which object it is where it cannot be hashed, as a dataclass of arrays; its target keeps it alive."""
+    try:
+        hash(setting)
+    except TypeError:
+        return type(setting), id(setting)
+    return setting
 
 
 def _program(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> str:
@@ -140,7 +150,7 @@ def _program(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> st
 
 
 def _make_target(model: Model, arrays: dict[str, Any], static: dict[str, Any]) -> Target:
-    declaration = declare(model, eqx.combine(arrays, static))
+    declaration = declare(model, eqx.combine(arrays, static), needs="weight")
     shapes = _unconstrained_shapes(model, arrays, static)
     if not declaration.latent:
         remedy = "Sample at least one unknown with numpyro.sample"

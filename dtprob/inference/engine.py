@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 import jax
+import numpy as np
 
 from dtprob import errors
 from dtprob.errors import InputError
@@ -109,12 +110,13 @@ def check_counts(engine: AbstractEngine, least: Mapping[str, int]) -> None:
         least: for each setting, the smallest number that works.
 
     Raises:
-        InputError: a setting is smaller.
+        InputError: a setting is smaller, or no whole number.
     """
     for name, bound in least.items():
-        value = getattr(engine, name)
+        value, what = getattr(engine, name), f"{name} of engine {engine.name}"
+        if not isinstance(value, int | np.integer):
+            raise InputError(what, "a whole number", repr(value), f"Write {name} as digits alone")
         if value < bound:
-            what = f"{name} of engine {engine.name}"
             raise InputError(what, f"{bound} or more", str(value), f"Give a larger {name}")
 
 

@@ -45,6 +45,7 @@ from dtprob.inference.resample import (
     chosen_scheme,
     cluster_axis,
     cluster_weights,
+    is_noise_unknown,
     with_noise,
 )
 from dtprob.inference.target import Inputs, Target
@@ -87,7 +88,8 @@ class Ensemble(AbstractEngine):
 
     With the base engine "point" a member is the mode of the density over the unconstrained coordinates, and
     a draw of the posterior; the statistic `diverging` marks those whose search did not arrive. With another
-    base engine all draws of all members are the posterior's, one member after the other in a single chain.
+    base engine all draws of all members are the posterior's, one member after the other in a single chain. The posterior's
+    `extra` says `noise_unknown` where noise was added to data whose noise is a latent site: it comes out too large.
 
     Attributes:
         members: how many data sets.
@@ -154,7 +156,11 @@ class Ensemble(AbstractEngine):
             key=key,
             options=options,
             stats={"diverging": failed[None]},
-            extra={"converged": not failed.any(), "resampled_by": np.asarray(scheme)},
+            extra={
+                "converged": not failed.any(),
+                "resampled_by": np.asarray(scheme),
+                "noise_unknown": scheme == "noise" and is_noise_unknown(target, inputs),
+            },
         )
 
     def _mode(self, target: Target, inputs: Inputs, key: PRNGKeyArray) -> Float[Array, " dimension"]:

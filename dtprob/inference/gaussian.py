@@ -33,6 +33,8 @@ def gaussian_posterior(target: Target, inputs: Inputs, key: PRNGKeyArray) -> Gau
     """
     what = f"model {target.declaration.name} for engine exact"
     remedy = "Use another engine, such as nuts or laplace"
+    if any(site.distribution == "Dirichlet" for site in target.declaration.latent.values()):
+        remedy = "Sample tables of log probabilities from dtprob.models.dirichlet.LogDirichlet, or use nuts"
     expected = "Dirichlet tables under counts, or a normal posterior"
     if target.angles.size:
         raise InputError(what, expected, "an angle", remedy)

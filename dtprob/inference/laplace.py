@@ -6,7 +6,7 @@ Source: Tierney and Kadane, Accurate approximations for posterior moments and ma
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple
 
 import jax
@@ -30,6 +30,7 @@ from dtprob.inference.modes import find_mode, objective_value
 from dtprob.inference.optimise import curvature, gradient_and_hessian
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
+from dtprob.inference.weights import tail_index
 from dtprob.models.arguments import Model
 from dtprob.models.supported import differentiated_forwards
 
@@ -65,8 +66,9 @@ class Laplace(AbstractEngine):
 
     The posterior's `extra` has `log_evidence`, `log_density` and `mode` (unconstrained), `mode.<site>` for
     each latent site, `precision`, `converged`, `promise` (nats that another step would gain), `agreeing`
-    (share of the starts that ended there) and `replaced` (directions in which the density does not fall
-    off; when it is not zero, the draws and the evidence are not to be trusted).
+    (share of the starts that ended there), `replaced` (directions in which the density does not fall
+    off; when it is not zero, the draws and the evidence are not to be trusted) and `pareto_k` (of the draws' importance
+    weights: above .7 the posterior is another one, such as one with a funnel, or with angles that are spread widely).
 
     Attributes:
         draws: how many draws.
@@ -110,7 +112,7 @@ class Laplace(AbstractEngine):
             gaussian: Gaussian = target.compiled(approximate)(mode.optimum.position, inputs)
         noise = jax.random.normal(draw_key, (self.draws, target.dimension))
         positions = gaussian.mode + noise @ gaussian.factor.T
-        return assemble(
+        posterior = assemble(
             target,
             inputs,
             positions[None],
@@ -119,6 +121,8 @@ class Laplace(AbstractEngine):
             options=options,
             extra=gaussian_facts(target, inputs, gaussian) | mode.facts(),
         )
+        heights = posterior.sample_stats["lp"][0] + 0.5 * np.sum(np.asarray(noise) ** 2, axis=1)
+        return replace(posterior, extra={**posterior.extra, "pareto_k": np.asarray(tail_index(heights))})
 
 
 def gaussian_facts(target: Target, inputs: Inputs, gaussian: Gaussian) -> dict[str, np.ndarray]:

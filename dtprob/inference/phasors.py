@@ -26,10 +26,10 @@ _ITERATIONS = 200
 
 
 def is_gaussian(target: Target) -> bool:
-    """Whether every observed site is normal, real or complex; one that a normal is the base of, as LogNormal, is not."""
-    return all(
-        site.distribution in _NORMAL and base_constraint(site.support) in _WHOLE
-        for site in target.declaration.observed.values()
+    """Whether all observed sites, and there are some, are normal, real or complex; LogNormal, whose base is, is not."""
+    observed = target.declaration.observed.values()
+    return bool(observed) and all(
+        site.distribution in _NORMAL and base_constraint(site.support) in _WHOLE for site in observed
     )
 
 

@@ -56,6 +56,8 @@ class Posterior:
             give zeros, and one for the acceptance rate.
         log_likelihood: for each observed site, the log likelihood of each observation, (chain, draw, *batch).
         observed: for each observed site, its data.
+        constant: for each other argument of the model that is an array, its values.
+        predicted: what the model would observe at each draw, (chain, draw, *event); see `dtprob.inference.predictive`.
         axes: for each site, the names of its dimensions, first to last.
         latent: the sites that were inferred; the others follow from them.
         circular: the sites whose values are angles.
@@ -68,6 +70,8 @@ class Posterior:
     sample_stats: Mapping[str, np.ndarray] = field(default_factory=dict)
     log_likelihood: Mapping[str, np.ndarray] = field(default_factory=dict)
     observed: Mapping[str, np.ndarray] = field(default_factory=dict)
+    constant: Mapping[str, np.ndarray] = field(default_factory=dict)
+    predicted: Mapping[str, np.ndarray] = field(default_factory=dict)
     axes: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     latent: tuple[str, ...] = ()
     circular: tuple[str, ...] = ()
@@ -119,8 +123,9 @@ class Posterior:
         return {name: self.flat(name)[index] for name in self.draws}
 
     def to_datatree(self) -> xr.DataTree:
-        """The ArviZ form: groups posterior, sample_stats, log_likelihood, observed_data and extra.
+        """The ArviZ form: groups posterior, sample_stats, log_likelihood, observed_data, constant_data and extra.
 
+        After `dtprob.inference.predictive` there is posterior_predictive, too.
         A complex site `x` becomes `x.real` and `x.imag`: neither ArviZ nor NetCDF takes complex numbers.
         """
         from dtprob.inference.storage import to_datatree  # noqa: PLC0415  (xarray takes a second to import)

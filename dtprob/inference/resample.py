@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 from numpyro.primitives import Messenger
 
@@ -80,6 +81,18 @@ def chosen_scheme(target: Target, wanted: Scheme | Literal["auto"], *, point: bo
         what = f"ensemble with noise on model {target.declaration.name}"
         raise InputError(what, expected, got, 'Resample with "weights" or "clusters"')
     return scheme
+
+
+def is_noise_unknown(target: Target, inputs: Inputs) -> bool:
+    """Whether the variance of an observed site hangs on latent sites, which noise added to data makes larger than it is."""
+    draws = target.once(Target.prior_draws)(jax.random.key(0), inputs, {})
+    one, other = (target.once(_variances)(draws[k], inputs) for k in (0, 1))
+    return any(not np.array_equal(one[name], other[name], equal_nan=True) for name in one)
+
+
+def _variances(target: Target, u: Float[Array, " dimension"], inputs: Inputs) -> dict[str, Array]:
+    _, trace = target.trace(u, inputs)
+    return {name: jnp.asarray(trace[name]["fn"].variance) for name in target.declaration.observed}
 
 
 def cluster_axis(declaration: Declaration) -> tuple[str, int]:

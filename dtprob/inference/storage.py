@@ -33,6 +33,8 @@ def to_datatree(posterior: Posterior) -> xr.DataTree:
         "sample_stats": _dataset(posterior.sample_stats, axes, _LEADING, {}),
         "log_likelihood": _dataset(posterior.log_likelihood, axes, _LEADING, posterior.coords),
         "observed_data": _dataset(posterior.observed, axes, (), posterior.coords),
+        "constant_data": _dataset(posterior.constant, axes, (), posterior.coords),
+        "posterior_predictive": _dataset(posterior.predicted, axes, _LEADING, posterior.coords),
         "extra": _dataset(posterior.extra, {}, (), {}),
     }
     filled = {name: dataset for name, dataset in groups.items() if name == "posterior" or dataset.data_vars}
@@ -44,6 +46,7 @@ def to_datatree(posterior: Posterior) -> xr.DataTree:
         "axes": json.dumps({name: list(names) for name, names in axes.items()}),
         "latent": json.dumps(list(posterior.latent)),
         "circular": json.dumps(list(posterior.circular)),
+        "counted": json.dumps(sorted(_counted(filled.values(), posterior.coords))),
         "names": json.dumps({new: old for old, new in written.items()}),
     }
     return tree
@@ -86,17 +89,20 @@ def from_datatree(tree: xr.DataTree, what: str = "data tree") -> Posterior:
     names = json.loads(tree.attrs.get("names", "{}"))
     groups = {group: renamed(child.to_dataset(), names) for group, child in tree.children.items()}
     arrays = {group: _arrays(dataset) for group, dataset in groups.items()}
+    counted = {*_LEADING, *json.loads(tree.attrs.get("counted", "[]"))}
     coords = {
         str(name): value.values
         for dataset in groups.values()
         for name, value in dataset.coords.items()
-        if name not in _LEADING
+        if name not in counted
     }
     return Posterior(
         draws=arrays.get("posterior", {}),
         sample_stats=arrays.get("sample_stats", {}),
         log_likelihood=arrays.get("log_likelihood", {}),
         observed=arrays.get("observed_data", {}),
+        constant=arrays.get("constant_data", {}),
+        predicted=arrays.get("posterior_predictive", {}),
         axes={name: tuple(names) for name, names in json.loads(tree.attrs["axes"]).items()},
         latent=tuple(json.loads(tree.attrs["latent"])),
         circular=tuple(json.loads(tree.attrs["circular"])),
@@ -138,9 +144,14 @@ def _dataset(
             attributes = {"complex_of": name} if np.iscomplexobj(array) else {}
             variables[key] = xr.Variable(dims[name], part, attributes)
     sizes = {dim: size for v in variables.values() for dim, size in zip(v.dims, v.shape, strict=True)}
-    known = {str(d): np.arange(n) for d, n in sizes.items() if d in leading}
+    known = {str(d): np.arange(n) for d, n in sizes.items() if d not in variables}
     known |= {d: np.asarray(c) for d, c in coords.items() if sizes.get(d) == len(c)}
     return xr.Dataset(variables, coords=known)
+
+
+def _counted(datasets: Iterable[xr.Dataset], coords: Mapping[str, np.ndarray]) -> set[str]:
+    """Axes whose values only count their entries, for ArviZ, which selects by values."""
+    return {str(name) for dataset in datasets for name in dataset.coords if name not in coords}
 
 
 def _parts(name: str, array: np.ndarray) -> Iterable[tuple[str, np.ndarray]]:

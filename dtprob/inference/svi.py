@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, Int, PRNGKeyArray, Scalar
-from scipy.special import logsumexp
 
 from dtprob.inference.assemble import assemble
 from dtprob.inference.build import build_target
@@ -49,6 +48,7 @@ from dtprob.inference.iterate import Job, Steps, iterate
 from dtprob.inference.modes import find_mode
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Inputs, Target
+from dtprob.inference.weights import weight_facts
 from dtprob.models.arguments import Model
 
 _WINDOW = 100  # updates between two looks at the bound
@@ -57,8 +57,6 @@ _SHRINK = 0.25
 _CLIP = 100.0  # nats per unit of a parameter
 _LARGEST_FULL = 100
 _TRIALS = 64
-_FEWEST = 25  # draws that a tail can be told from
-_SAME = 1e-6  # nats between log weights that are told from rounding
 _EVALUATED = 32  # draws whose weights are evaluated at once
 
 
@@ -211,24 +209,6 @@ class SVI(AbstractEngine):
         keys = jax.random.split(trial_key, _TRIALS)
         heights = [bound(anchor, keys, inputs) for anchor in (at_mode, at_prior)]
         return at_prior if heights[1] > heights[0] else at_mode
-
-
-def weight_facts(log_weight: Float[np.ndarray, " draw"]) -> dict[str, Any]:
-    """What importance weights tell of a guide: the tail index of Pareto's, and the log evidence.
-
-    Args:
-        log_weight: log posterior, not normalised, less log density of the guide, at draws of the guide.
-    """
-    from arviz_stats.base import array_stats  # noqa: PLC0415  (takes a second)
-
-    evidence = float(logsumexp(log_weight) - np.log(log_weight.size))
-    if log_weight.size < _FEWEST:
-        return {"pareto_k": np.nan, "log_evidence": evidence}
-    if np.ptp(log_weight) < _SAME:
-        return {"pareto_k": -np.inf, "log_evidence": evidence}
-    # It takes minus the log weights, as of a likelihood that is left out.
-    _, index = array_stats.psislw(-log_weight)
-    return {"pareto_k": float(index), "log_evidence": evidence}
 
 
 def _optimiser(rate: Any) -> optax.GradientTransformation:

@@ -290,7 +290,24 @@ def _constrained(free: Mapping[str, Array], message: dict[str, Any]) -> Array | 
     index = message["infer"].get("_scan_current_index")
     if index is not None:
         value = value[index]
+        _refuse_nested(message, value)
     return wrap(value) if _is_circular(message) else dist.biject_to(message["fn"].support)(value)
+
+
+def _refuse_nested(message: Mapping[str, Any], value: Array) -> None:
+    """Of scans within scans NumPyro gives each step the whole of the inner one's values, which would be broadcast.
+
+    Raises:
+        InputError: the value has more axes than one step of the site.
+    """
+    shape = message["fn"].shape(message["kwargs"].get("sample_shape", ()))
+    one_step = shape if _is_circular(message) else dist.biject_to(message["fn"].support).inverse_shape(shape)
+    if value.ndim > len(one_step):
+        what, remedy = (
+            f"site {message['name']!r}",
+            "Scan once over all steps, or loop over the outer ones in Python",
+        )
+        raise InputError(what, "latent sites within one scan", "a scan within a scan", remedy)
 
 
 def _log_det(message: Mapping[str, Any], free: Array) -> Scalar:

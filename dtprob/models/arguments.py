@@ -69,10 +69,19 @@ def taking(model: Model, data: Data, column: str | None) -> Model:
 def as_arrays(data: Data) -> dict[str, Any]:
     """Data whose columns are arrays: lists of numbers and what turns into an array, as columns of pandas, are converted.
 
+    Within dictionaries lists are left alone, which may be settings.
+
     Raises:
         InputError: a column holds text or other objects.
     """
     return {name: _column(name, entry) for name, entry in dict(data).items()}
+
+
+def _within(name: str, entry: Any) -> Any:
+    """What a dictionary among the data holds, columns of pandas as arrays."""
+    if isinstance(entry, dict):
+        return {key: _within(f"{name}[{key!r}]", value) for key, value in entry.items()}
+    return _column(name, entry) if hasattr(entry, "__array__") else entry
 
 
 def doubled(data: Data) -> dict[str, Any]:
@@ -92,6 +101,8 @@ def _column(name: str, entry: Any) -> Any:
         isinstance(entry, np.ndarray | np.generic) and entry.dtype.kind in _NUMBERS
     ):
         return entry
+    if isinstance(entry, dict):
+        return _within(name, entry)
     if not (is_column or isinstance(entry, list)):
         return entry
     try:
@@ -147,6 +158,12 @@ def lacking(function: Model, data: Data) -> list[str]:
         and parameter.default is parameter.empty
         and name not in data
     ]
+
+
+def left_out(function: Model, data: Data) -> list[str]:
+    """Arguments that are None, given or by default, as observations are that nobody made."""
+    parameters = inspect.signature(function).parameters
+    return [name for name, one in parameters.items() if data.get(name, one.default) is None]
 
 
 def split_static(data: Data) -> tuple[dict[str, Any], dict[str, Any]]:

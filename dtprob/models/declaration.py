@@ -20,7 +20,7 @@ from numpyro.distributions import constraints, distribution
 from numpyro.primitives import Messenger
 
 from dtprob.errors import InputError, raised_at
-from dtprob.models.arguments import Data, Model, model_name, select_arguments, split_static, whole
+from dtprob.models.arguments import Data, Model, left_out, model_name, select_arguments, split_static, whole
 from dtprob.models.axes import axes_of, lent
 from dtprob.wrapping import unwrapped
 
@@ -29,6 +29,7 @@ from dtprob.wrapping import unwrapped
 numpyro.distributions.__dict__["distribution"] = distribution
 
 type Kind = Literal["latent", "deterministic", "observed"]
+type Needs = Literal["observation", "weight", "nothing"]
 
 NOT_TRACED = (
     jax.errors.ConcretizationTypeError,
@@ -39,7 +40,10 @@ NOT_TRACED = (
 """What JAX raises where a program asks for values that it does not know yet."""
 _METADATA = "__dtprob__"
 _MISFIT: Final = "ncompatible shapes for broadcasting"
+_BY_NAME: Final = "does not support string indexing"
 """In what JAX says of them."""
+_NO_ROW: Final = "size of plate should be positive"
+"""In what NumPyro says of one."""
 
 
 @dataclass(frozen=True)
@@ -178,7 +182,8 @@ def trace_model(
     """One execution of the model: the NumPyro trace, latent sites drawn from the prior unless substituted.
 
     Raises:
-        InputError: arrays whose shapes do not fit, as those of data longer than their plate.
+        InputError: arrays whose shapes do not fit, as those of data longer than their plate; a plate without rows; or a
+            table whose columns are called by name.
     """
     seeded = handlers.seed(function, key)
     values = {name: jnp.asarray(value) for name, value in (substitute or {}).items()}  # a scan indexes them
@@ -186,9 +191,16 @@ def trace_model(
     try:
         return traced.get_trace(**data)
     except (TypeError, ValueError) as error:
+        if _BY_NAME in str(error):
+            raise _by_name(function, error) from error
         if _MISFIT not in str(error):
             raise
         raise _misfit(function, error, traced.trace) from error
+    except AssertionError as error:
+        if _NO_ROW not in str(error):
+            raise
+        what, remedy = f"model {model_name(function)}", "Give the data at least one row"
+        raise InputError(what, "plates of one or more", "one of size 0", remedy) from error
 
 
 def look_at_trace(function: Model, data: Data, look: Callable[[str, dict[str, Any]], None]) -> None:
@@ -206,6 +218,15 @@ def look_at_trace(function: Model, data: Data, look: Callable[[str, dict[str, An
             look(name, message)
 
     jax.eval_shape(run, arrays, jax.random.key(0))
+
+
+def _by_name(function: Model, error: Exception) -> InputError:
+    """Of a table whose columns the model calls by name, while models get arrays."""
+    where = f" ({place})" if (place := raised_at(error)) else ""
+    remedy = "Hand the table over as a dictionary of its columns, {'TABLE': dict(TABLE)}, or each column as an argument"
+    return InputError(
+        f"model {model_name(function)}{where}", "arrays indexed by numbers", "one indexed by a name", remedy
+    )
 
 
 def _misfit(function: Model, error: Exception, trace: Mapping[str, Mapping[str, Any]]) -> InputError:
@@ -229,13 +250,17 @@ class _Names(Messenger):
         self.last = msg.get("name") or self.last
 
 
-def declare(function: Model, data: Data, *, cluster: str | None = None) -> Declaration:
+def declare(
+    function: Model, data: Data, *, cluster: str | None = None, needs: Needs = "observation"
+) -> Declaration:
     """Run the model once, abstractly, and tell its sites and axes.
 
     Args:
         function: a NumPyro model; its arguments are the data's entries by name.
         data: arrays and settings by argument name; the observed ones present.
         cluster: overrides the model's own cluster axis.
+        needs: "weight" allows a model that observes nothing, but weighs its data by `numpyro.factor`, as a likelihood that
+            is summed by hand over hidden states, if all its arguments are given; "nothing" one without its data.
 
     Raises:
         InputError: the data do not match the model's arguments, or the model observes nothing.
@@ -264,7 +289,11 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
             what, inside = f"model {model_name(function)}", "Move the plate into the function that is scanned"
             raise InputError(what, "no scan within a plate", "one", inside) from error
         what, got = f"model {model_name(function)}", f"one that cannot at {names.last!r}"
-        remedy = "Give every parameter a proper prior; a wide one will do"
+        remedies = (
+            "Give every parameter a proper prior; a wide one will do",
+            "Leave CircularReparam out: angles are moved around the circle without it",
+        )
+        remedy = remedies[(names.last or "").endswith("_unwrapped")]
         raise InputError(what, "distributions that can be drawn from", got, remedy) from error
     except NOT_TRACED as error:
         where = f" ({place})" if (place := raised_at(error)) else ""
@@ -278,6 +307,23 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
     declaration = Declaration(
         model_name(function), found, cluster or notes.cluster or _first_plate(found), tuple(factors)
     )
+    weighs = needs == "weight" and factors and not left_out(function, data)
+    if needs != "nothing" and not weighs:
+        _refuse_unobserved(declaration)
+    for name, measure in notes.measures.items():
+        if measure.site not in declaration.observed:
+            known = ", ".join(declaration.observed)
+            remedy = "Name the observed site of whose entries it tells"
+            raise InputError(f"measure {name}", f"an observed site among {known}", repr(measure.site), remedy)
+    return declaration
+
+
+def _refuse_unobserved(declaration: Declaration) -> None:
+    """Look for what data say.
+
+    Raises:
+        InputError: the model observes nothing.
+    """
     if not declaration.observed:
         raise InputError(
             f"model {declaration.name}",
@@ -285,12 +331,6 @@ def declare(function: Model, data: Data, *, cluster: str | None = None) -> Decla
             "none",
             "Pass the observed data, and give it to numpyro.sample as obs; a numpyro.factor counts as a prior.",
         )
-    for name, measure in notes.measures.items():
-        if measure.site not in declaration.observed:
-            known = ", ".join(declaration.observed)
-            remedy = "Name the observed site of whose entries it tells"
-            raise InputError(f"measure {name}", f"an observed site among {known}", repr(measure.site), remedy)
-    return declaration
 
 
 def _with_lent_axes(sites: Mapping[str, Site]) -> dict[str, Site]:

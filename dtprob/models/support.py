@@ -1,4 +1,7 @@
-"""Observed values that a model's distributions cannot take, to which NumPyro gives a density all the same."""
+"""Observed values that a model's distributions cannot take, to which NumPyro gives a density all the same.
+
+Where a support ends may be unknown: a uniform delay's largest value, the shift of an exponential one.
+"""
 
 from __future__ import annotations
 
@@ -32,20 +35,23 @@ def check_support(model: Model, data: Data, where: str = "data", own: Sequence[s
         own: arguments that hold those of many data sets, stacked on a leading axis.
 
     Raises:
-        InputError: a value that counts is outside the support of its distribution at each draw.
+        InputError: a value that counts is outside the support of its distribution at each draw, beyond an end that
+            does not move from draw to draw.
     """
     arrays, static = split_static(select_arguments(model, data))
 
     families: dict[str, str] = {}
 
-    def one(arrays: Mapping[str, Any], key: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
-        """Values and which are allowed."""
+    def one(arrays: Mapping[str, Any], key: jax.Array) -> dict[str, tuple[jax.Array, ...]]:
+        """Values, which are allowed, and where the support ends."""
         trace = trace_model(model, eqx.combine(arrays, static), key)
         seen = {n: site for n, site in trace.items() if site["type"] == "sample" and site["is_observed"]}
         bounded = {n: site for n, site in seen.items() if _ends(site["fn"].support) is not None}
         families.update({n: type(unwrapped(site["fn"])[0]).__name__ for n, site in bounded.items()})
         values = {n: jnp.asarray(site["value"]) for n, site in bounded.items()}
-        return {n: (value, _allows(bounded[n]["fn"], value)) for n, value in values.items()}
+        return {
+            n: (value, _allows(bounded[n]["fn"], value), *_limits(bounded[n])) for n, value in values.items()
+        }
 
     keys = jax.random.split(jax.random.key(0), _DRAWS)
     axes = {name: 0 if name in own else None for name in arrays}
@@ -58,10 +64,30 @@ def check_support(model: Model, data: Data, where: str = "data", own: Sequence[s
         looked = jax.jit(lambda arrays, keys: jax.lax.map(lambda key: _each(one, axes)(arrays, key), keys))
         found = looked(arrays, keys)
     for name, family in families.items():  # the first of the model is named
-        values, allowed = found[name]
-        refused = ~np.asarray(allowed).any(axis=0)
+        values, allowed, low, high = (np.asarray(part) for part in found[name])
+        refused = ~(allowed | _beyond_moving(values, allowed.shape, low, high)).any(axis=0)
         if refused.any():
             raise _refusal(f"{where}, observed site {name!r}", family, np.asarray(values[0]), refused)
+
+
+def _limits(message: Mapping[str, Any]) -> tuple[jax.Array, jax.Array]:
+    """The least and the largest value that each entry of a site can have, infinite where there is none."""
+    one, shape = base_constraint(message["fn"].support), jnp.shape(message["value"])
+    ends = getattr(one, "lower_bound", -jnp.inf), getattr(one, "upper_bound", jnp.inf)
+    return jnp.broadcast_to(ends[0], shape), jnp.broadcast_to(ends[1], shape)
+
+
+def _moves(end: np.ndarray) -> np.ndarray:
+    """Where a support's end, (draw, ...), is not the same at all draws."""
+    return (end != end[:1]).any(axis=0)
+
+
+def _beyond_moving(
+    values: np.ndarray, shape: tuple[int, ...], low: np.ndarray, high: np.ndarray
+) -> np.ndarray:
+    """Which values are outside on a side that moves, so that another draw may allow them, of a shape (draw, *batch)."""
+    beyond = (_moves(low) & (values < low)) | (_moves(high) & (values > high))
+    return beyond.reshape(*shape, -1).any(axis=-1)
 
 
 def _each(one: Callable[..., Any], axes: Mapping[str, int | None]) -> Callable[..., Any]:

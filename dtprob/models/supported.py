@@ -6,11 +6,12 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from typing import Any
 
-from numpyro.distributions import biject_to, constraints
+from numpyro.distributions import Delta, biject_to, constraints
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, model_name
 from dtprob.models.declaration import Declaration, base_constraint, look_at_trace
+from dtprob.wrapping import unwrapped
 
 
 @contextmanager
@@ -96,6 +97,9 @@ def refuse_obs_mask(declaration: Declaration) -> None:
 
 def _refuse_latent(what: str, name: str, fn: Any) -> None:
     support = base_constraint(fn.support)
+    if isinstance(unwrapped(fn)[0], Delta):
+        remedy = f"Write numpyro.deterministic({name!r}, VALUE)"
+        raise InputError(what, "unknowns with a density", f"the latent site {name!r} (Delta)", remedy)
     kind = f"{name!r} ({type(fn).__name__})"
     if support is None or support.is_discrete:
         remedy = (
@@ -111,5 +115,7 @@ def _refuse_latent(what: str, name: str, fn: Any) -> None:
             biject_to(fn.support)
         except NotImplementedError:
             remedy = "Sample a real or positive site and compute it from that"
+            if support is constraints.sphere:
+                remedy = f"Reparametrise it: numpyro.handlers.reparam(model, config={{{name!r}: ProjectedNormalReparam()}})"
             got = f"the latent site {kind}"
             raise InputError(what, "supports that NumPyro maps to the reals", got, remedy) from None

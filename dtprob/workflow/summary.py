@@ -106,6 +106,8 @@ def _warnings(rows: dict[str, dict[str, Any]], diverging: int, posterior: Poster
         yield f"Fewer than {ENOUGH_DRAWS:.0f} effective draws of {_some(few)}: run longer."
     if not np.all(posterior.extra.get("converged", True)):
         yield "The search or the fit of the engine did not converge: give it more steps, or more starts."
+    if np.any(posterior.extra.get("noise_unknown", False)):
+        yield "The ensemble added noise to data whose noise is unknown, which comes out too large: confirm with nuts."
     yield from _of_mode(posterior)
     if infinite := [name for name, row in rows.items() if "mean" not in row]:
         yield f"Some draws of {_some(infinite)} are not finite, so that it has no mean: confirm with nuts."

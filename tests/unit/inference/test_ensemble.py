@@ -13,6 +13,7 @@ from dtprob.inference import Ensemble
 from dtprob.inference.build import build_target
 from dtprob.inference.ensemble import _places
 from dtprob.inference.resample import chosen_scheme
+from dtprob.workflow.summary import summarise
 from tests.unit.inference.examples import (
     at_the_cut,
     at_the_cut_data,
@@ -182,3 +183,22 @@ def test_settings_of_another_base_are_refused():
         Ensemble(members=4, settings={"objective": "maximum_likelihood"})
     with pytest.raises(InputError, match="a value for each site by name"):
         Ensemble(members=4, initial="zzz")
+
+
+@pytest.mark.parametrize("is_known", [True, False])
+def test_noise_added_to_data_of_unknown_noise_is_told(is_known):
+    """Whose variance doubles: the noise comes out larger by the root of two."""
+
+    def model(y=None):
+        mean = numpyro.sample("mean", dist.Normal(0.0, 5.0))
+        noise = 2.0 if is_known else numpyro.sample("noise", dist.HalfNormal(5.0))
+        with numpyro.plate("row", 100):
+            numpyro.sample("y", dist.Normal(mean, noise), obs=y)
+
+    y = 2 * np.random.default_rng(0).normal(size=100)
+    found = Ensemble(members=64)(jax.random.key(0), model, {"y": y})
+    assert bool(found.extra["noise_unknown"]) != is_known
+    warned = [text for text in summarise(found)["warnings"] if "whose noise is unknown" in text]
+    assert bool(warned) != is_known
+    if not is_known:
+        assert found.draws["noise"].mean() == pytest.approx(2**0.5 * y.std(), rel=0.1)

@@ -136,3 +136,26 @@ def test_a_concentration_that_varies_with_another_table_is_refused():
 
     with pytest.raises(InputError, match="concentrations that are known, got one that varies at 'second'"):
         Exact()(KEY, nested, {"y": jnp.array([0, 1, 0, 0])})
+
+
+@pytest.mark.parametrize("is_log", [False, True])
+def test_tables_of_a_plain_dirichlet_are_told_how_to_be_exact(is_log):
+    before, after = np.array([0, 0, 1, 1, 1, 0]), np.array([0, 1, 1, 1, 0, 1])
+
+    def model(before, after=None):
+        if is_log:
+            logits = numpyro.sample("p", LogDirichlet(1.0, np.ones((2, 2), bool)))
+        else:
+            logits = jnp.log(numpyro.sample("p", dist.Dirichlet(jnp.ones(2)).expand([2]).to_event(1)))
+        with numpyro.plate("slot", before.shape[0]):
+            numpyro.sample("after", dist.Categorical(logits=logits[before]), obs=after)
+
+    given = {"before": before, "after": after}
+    if not is_log:
+        with pytest.raises(
+            InputError, match=r"Sample tables of log probabilities from dtprob\.models\.dirichlet"
+        ):
+            Exact()(KEY, model, given)
+        return
+    draws = np.exp(Exact(draws=4000)(KEY, model, given).draws["p"])
+    np.testing.assert_allclose(draws.mean(axis=(0, 1)), [[2 / 5, 3 / 5], [2 / 5, 3 / 5]], atol=0.02)

@@ -108,6 +108,12 @@ def test_a_setting_that_is_no_choice_is_refused(engine, setting, value, remedy):
         fit(normal, normal_data(), engine=engine, key=KEY, **{setting: value})
 
 
+@pytest.mark.parametrize("value", [2.5, "100"])
+def test_a_count_that_is_no_whole_number_is_refused(value):
+    with pytest.raises(InputError, match=r"draws of engine nuts: expected a whole number, got '?\d+"):
+        fit(normal, normal_data(), key=KEY, draws=value)
+
+
 @pytest.mark.parametrize("engine", ["nuts", "blackjax_nuts"])
 def test_chains_do_not_stand_where_the_density_is_nowhere_finite(engine):
     def model(y=None):

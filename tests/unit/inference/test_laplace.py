@@ -120,3 +120,29 @@ def test_failures_and_settings_are_told():
     with pytest.raises(InputError, match="draws of engine laplace: expected 1 or more, got 0"):
         Laplace(draws=0)(KEY, normal, normal_data())
     assert not bool(Laplace(max_steps=1, starts=1)(KEY, logistic, logistic_data()).extra["converged"])
+
+
+def walk(y=None):
+    """A random walk of unknown step: the density grows without bound where the step and all increments shrink."""
+    step = numpyro.sample("step", dist.LogNormal(-0.5, 0.5))
+    state = numpyro.sample("state", dist.GaussianRandomWalk(step, num_steps=y.shape[0]))
+    with numpyro.plate("time", y.shape[0]):
+        numpyro.sample("y", dist.Normal(state, 1.0), obs=y)
+
+
+def known_walk(y=None):
+    """The same with a known step, whose posterior is normal."""
+    state = numpyro.sample("state", dist.GaussianRandomWalk(0.5, num_steps=y.shape[0]))
+    with numpyro.plate("time", y.shape[0]):
+        numpyro.sample("y", dist.Normal(state, 1.0), obs=y)
+
+
+def test_importance_weights_tell_of_a_funnel():
+    """Its answer is a step of almost zero, known exactly; all other facts of the search look well."""
+    rng = np.random.default_rng(7)
+    y = jnp.asarray(np.cumsum(0.5 * rng.normal(size=60)) + rng.normal(size=60))
+    found = Laplace()(jax.random.key(3), walk, {"y": y})
+    assert found.extra["converged"]
+    assert found.extra["replaced"] == 0
+    assert found.extra["pareto_k"] > 0.7
+    assert Laplace()(jax.random.key(3), known_walk, {"y": y}).extra["pareto_k"] < 0.5

@@ -130,6 +130,21 @@ def test_arviz_takes_the_tree():
     table = az.summary(tree, var_names=["level", "phase"])
     assert len(table) == 5
     assert np.isfinite(az.loo(tree).elpd)
+    assert tree["posterior"]["phase"].sel({"snapshot.1": 0, "path": 3}).shape == (2, 50)
+
+
+@pytest.mark.filterwarnings("ignore:Matplotlib is building the font cache:UserWarning")
+def test_arviz_plots_sites_with_axes():
+    """Ranks are plotted by the values of the axes."""
+    import arviz as az
+
+    az.plot_rank(posterior().to_datatree(), var_names=["phase"], backend="none")
+
+
+def test_an_axis_may_be_called_as_a_site_is():
+    draws = {"path": RANDOM.normal(size=(2, 5)), "gain": RANDOM.normal(size=(2, 5, 3))}
+    tree = Posterior(draws=draws, axes={"gain": ("path",)}, latent=("path", "gain")).to_datatree()
+    assert tree["posterior"]["gain"].dims == ("chain", "draw", "path")
 
 
 def test_a_failed_save_leaves_the_old_file(tmp_path, monkeypatch):

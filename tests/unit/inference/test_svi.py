@@ -9,7 +9,7 @@ import pytest
 from scipy import special
 
 from dtprob.inference import SVI
-from dtprob.inference.svi import weight_facts
+from dtprob.inference.weights import weight_facts
 from tests.unit.inference.examples import at_the_cut, at_the_cut_data, normal, normal_data, normal_posterior
 
 KEY = jax.random.key(5)

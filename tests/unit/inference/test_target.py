@@ -1,5 +1,6 @@
 """The target: density, Jacobian, coordinates, data as arguments, and models that it refuses."""
 
+import dataclasses
 import functools
 
 import jax
@@ -13,6 +14,7 @@ from scipy import integrate, stats
 
 from dtprob.errors import InputError
 from dtprob.inference.build import build_target
+from dtprob.inference.fit import fit
 from dtprob.inference.laplace import Laplace
 from dtprob.inference.modes import starting_points
 from dtprob.inference.target import Target
@@ -234,6 +236,8 @@ def refused(kind):
             numpyro.sample("x", ComplexNormal(0j, 1.0))
         elif kind == "sphere":
             numpyro.sample("x", dist.ProjectedNormal(jnp.ones(2)))
+        elif kind == "certain":
+            numpyro.sample("x", dist.Delta(jnp.ones(2)).to_event(1))
         elif kind == "subsample":
             numpyro.sample("z", dist.Normal(0.0, 1.0))
             with numpyro.plate("part", 10, subsample_size=3):
@@ -250,7 +254,8 @@ def refused(kind):
         ("discrete", "the discrete latent site 'x'.*Sum it out"),
         ("parameter", "the parameter site 'x'.*numpyro.sample"),
         ("complex", "the complex latent site 'x'.*real and imaginary"),
-        ("sphere", "the latent site 'x'.*Sample a real"),
+        ("sphere", "the latent site 'x'.*config={'x': ProjectedNormalReparam()"),
+        ("certain", r"the latent site 'x' .Delta.\. Write numpyro.deterministic"),
         ("subsample", "plate 'part' that takes 3 of 10.*full size"),
         ("nothing", "expected a latent site, got none"),
     ],
@@ -315,3 +320,84 @@ def test_what_a_model_masks_may_be_no_number():
     x, holes = np.arange(5.0), np.where(np.arange(5) == 2, np.nan, 1.0)
     found = Laplace(draws=10)(KEY, with_holes, {"x": x, "y": holes, "seen": np.isfinite(holes)})
     assert found.extra["mode.slope"] == pytest.approx(8.0 / 27.0)
+
+
+def weighed(y):
+    """A likelihood that is summed by hand over a hidden state."""
+    mean = numpyro.sample("mean", dist.Normal(0.0, 2.0))
+    numpyro.factor("of_y", dist.Normal(mean, 1.0).log_prob(y).sum())
+
+
+def weighed_besides(y, z=None):
+    weighed(y)
+    if z is not None:
+        numpyro.sample("z", dist.Normal(0.0, 1.0), obs=z)
+
+
+@pytest.mark.parametrize("engine", ["nuts", "laplace", "exact"])
+def test_a_factor_alone_may_hold_the_data(engine):
+    y = jnp.array([0.5, 1.5, 2.5])
+    with pytest.raises(InputError, match="expected an observed site, got none"):
+        fit(weighed_besides, {"y": y}, engine=engine, key=KEY)
+    posterior = fit(weighed, {"y": y}, engine=engine, key=KEY)
+    variance = 1 / (3 + 0.25)
+    assert posterior.draws["mean"].mean() == pytest.approx(variance * 4.5, abs=0.1)
+    assert posterior.draws["mean"].std() == pytest.approx(variance**0.5, rel=0.1)
+
+
+def test_a_model_without_observed_sites_is_not_resampled():
+    with pytest.raises(
+        InputError, match="ensemble on model weighed: expected a plate of independent clusters"
+    ):
+        fit(weighed, {"y": Y}, engine="ensemble", key=KEY)
+
+
+@dataclasses.dataclass
+class Survey:
+    """What a user keeps together."""
+
+    distance: np.ndarray
+    unit: str
+
+
+def test_data_may_be_objects_that_are_neither_arrays_nor_hashable():
+    def model(survey, y=None):
+        mean = numpyro.sample("mean", dist.Normal(0.0, 1.0))
+        with numpyro.plate("row", 2):
+            numpyro.sample("y", dist.Normal(mean * survey.distance, 1.0), obs=y)
+
+    survey = Survey(np.ones(2), "m")
+    first, inputs = build_target(model, {"survey": survey, "y": Y})
+    again, _ = build_target(model, {"survey": survey, "y": Y})
+    assert first is again
+    survey.distance = np.full(2, 3.0)
+    changed, _ = build_target(model, {"survey": survey, "y": Y})
+    u = jnp.ones(1)
+    assert changed.log_density(u, inputs) == pytest.approx(density_of(3.0, inputs))
+
+
+def density_of(distance, inputs):
+    """The log density of one standard deviation of the prior there, in nats."""
+    mean = float(inputs.location[0] + inputs.scale[0])
+    terms = stats.norm.logpdf(mean), 2 * stats.norm.logpdf(mean * distance), np.log(float(inputs.scale[0]))
+    return sum(terms)
+
+
+def walks(y=None):
+    """A scan within a scan."""
+
+    def inner(before, seen):
+        now = numpyro.sample("state", dist.Normal(before, 1.0))
+        numpyro.sample("y", dist.Normal(now, 1.0), obs=seen)
+        return now, None
+
+    scan(lambda before, seen: (scan(inner, before, seen)[0], None), 0.0, y)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (3, 4)])
+def test_a_scan_within_a_scan_is_refused(shape):
+    """With fewer inner steps than outer ones there was an answer, of a density that was broadcast."""
+    with pytest.raises(
+        InputError, match=r"site 'state': expected latent sites within one scan.*Scan once over all"
+    ):
+        fit(walks, {"y": jnp.ones(shape)}, engine="laplace", key=KEY)

@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro
 import numpyro.distributions as dist
+import pandas as pd
 import pytest
+from numpyro import handlers
+from numpyro.infer.reparam import CircularReparam
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import model_name, select_arguments, split_static
@@ -201,3 +204,35 @@ def test_a_prior_that_cannot_be_drawn_from_is_named():
 
     with pytest.raises(InputError, match=r"one that cannot at 'level'\. Give every parameter a proper prior"):
         declare(improper, {"y": jnp.zeros(3)})
+
+
+def of_table(table, y=None):
+    slope = numpyro.sample("slope", dist.Normal())
+    with numpyro.plate("row", len(table)):
+        numpyro.sample("y", dist.Normal(slope * table["x"], 1.0), obs=y)
+
+
+def test_what_numpyro_and_jax_say_of_tables_and_empty_plates_is_said_in_a_line():
+    table = pd.DataFrame({"x": np.ones(3)})
+    with pytest.raises(
+        InputError, match=r"test_declaration\.py, line \d+.*indexed by a name\. Hand the table"
+    ):
+        declare(of_table, {"table": table, "y": np.ones(3)})
+    with pytest.raises(InputError, match="expected plates of one or more, got one of size 0"):
+        declare(outside, {"distance": jnp.ones(0), "height": jnp.ones(0), "y": jnp.ones(0)})
+
+
+def test_columns_within_a_dictionary_are_arrays():
+    found = select_arguments(plain, {"x": {"a": pd.Series([1.0, 2.0]), "b": [1, 2]}, "degree": 1})
+    assert isinstance(found["x"]["a"], np.ndarray)
+    assert found["x"]["b"] == [1, 2]
+
+
+def test_angles_need_no_circular_reparametrisation():
+    def model(y):
+        angle = numpyro.sample("angle", dist.VonMises(0.0, 1.0))
+        numpyro.sample("y", dist.VonMises(angle, 2.0), obs=y)
+
+    turned = handlers.reparam(model, config={"angle": CircularReparam()})
+    with pytest.raises(InputError, match=r"'angle_unwrapped'\. Leave CircularReparam out"):
+        declare(turned, {"y": jnp.asarray(1.0)})

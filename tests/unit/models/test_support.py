@@ -92,3 +92,15 @@ def test_the_first_site_of_the_model_is_named():
     data = {"sent": jnp.array([9, -3, 9]), "lost": jnp.array([1, 2, 3])}
     with pytest.raises(InputError, match="'sent'"):
         check_support(model, data)
+
+
+def uniform_below(y=None):
+    end = numpyro.sample("end", dist.Pareto(0.1, 1.0))
+    with numpyro.plate("row", 3):
+        numpyro.sample("y", dist.Uniform(0.0, end), obs=y)
+
+
+def test_a_value_beyond_an_unknown_end_is_let_through_where_few_prior_draws_allow_it():
+    check_support(uniform_below, {"y": jnp.array([0.1, 50.0, 1.0])})
+    with pytest.raises(InputError, match=r"got -1\.0* at \[1\]\. Correct"):
+        check_support(uniform_below, {"y": jnp.array([0.1, -1.0, 1.0])})
