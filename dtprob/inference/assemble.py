@@ -18,7 +18,8 @@ from dtprob.inference.engine import AbstractEngine, RunOptions
 from dtprob.inference.posterior import Posterior
 from dtprob.inference.target import Evaluation, Inputs, Target
 from dtprob.models.axes import lent, unnamed_axes
-from dtprob.models.declaration import Declaration, trace_model
+from dtprob.models.declaration import Declaration
+from dtprob.models.execution import trace_model
 
 _BLOCK, _BLOCK_ENTRIES = 32, 2_000_000
 _RECORDED = ("jax", "numpyro", "blackjax")

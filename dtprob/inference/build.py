@@ -16,7 +16,8 @@ from dtprob.inference.circular import mean_direction
 from dtprob.inference.program import program_hash
 from dtprob.inference.target import Coordinates, Inputs, Target, free_value
 from dtprob.models.arguments import Data, Model, split_static
-from dtprob.models.declaration import declare, trace_model
+from dtprob.models.declaration import declare
+from dtprob.models.execution import trace_model
 from dtprob.models.supported import refuse_obs_mask, refuse_unsupported
 from dtprob.xla import warn_of_miscompilation
 

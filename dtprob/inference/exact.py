@@ -36,8 +36,9 @@ from dtprob.inference.laplace import gaussian_facts
 from dtprob.inference.posterior import Posterior, Values
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
-from dtprob.models.declaration import Site, trace_model
+from dtprob.models.declaration import Site
 from dtprob.models.dirichlet import LogRatios, LogSimplices, log_draws, log_shares
+from dtprob.models.execution import trace_model
 
 type Tables = dict[str, Float[Array, "*row outcome"]]
 

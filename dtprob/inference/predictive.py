@@ -17,7 +17,8 @@ from dtprob.errors import InputError
 from dtprob.inference.engine import check_key
 from dtprob.inference.posterior import Posterior
 from dtprob.models.arguments import Model, model_name, select_arguments, split_static
-from dtprob.models.declaration import declare, is_factor, trace_model
+from dtprob.models.declaration import declare, is_factor
+from dtprob.models.execution import trace_model
 
 _BATCH: Final = 32
 """Draws that are foreseen side by side."""

@@ -30,7 +30,8 @@ from numpyro.infer.util import compute_log_probs
 from dtprob.errors import InputError, unknown_name
 from dtprob.inference.circular import wrap
 from dtprob.models.arguments import Model
-from dtprob.models.declaration import Declaration, base_constraint, trace_model
+from dtprob.models.declaration import Declaration, base_constraint
+from dtprob.models.execution import trace_model
 
 PRIOR_DRAWS = 64
 

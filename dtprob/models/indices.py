@@ -14,7 +14,7 @@ from jax.experimental import checkify
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, select_arguments, split_static
-from dtprob.models.declaration import NOT_TRACED, trace_model
+from dtprob.models.execution import NOT_TRACED, trace_model
 
 _SAID: Final = re.compile(r"index (-?\d+) is out of bounds for axis \d+ with size (\d+)")
 

@@ -16,7 +16,8 @@ import numpyro
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, select_arguments, split_static
-from dtprob.models.declaration import NOT_TRACED, base_constraint, trace_model
+from dtprob.models.declaration import base_constraint
+from dtprob.models.execution import NOT_TRACED, trace_model
 from dtprob.wrapping import unwrapped
 
 _DRAWS: Final = 8

@@ -10,7 +10,8 @@ from numpyro.distributions import Delta, biject_to, constraints
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import Data, Model, model_name
-from dtprob.models.declaration import Declaration, base_constraint, look_at_trace
+from dtprob.models.declaration import Declaration, base_constraint
+from dtprob.models.execution import look_at_trace
 from dtprob.wrapping import unwrapped
 
 

@@ -19,7 +19,7 @@ from scipy import stats
 
 from dtprob.inference.engine import LATENTS_ONLY, AbstractEngine
 from dtprob.models.arguments import Model
-from dtprob.models.declaration import trace_model
+from dtprob.models.execution import trace_model
 
 DRAWS = 19
 """Draws that a true value is ranked among: its rank has 20 values, and the middle 18 are the 90% interval."""

@@ -14,7 +14,8 @@ from dtprob.inference.build import build_target
 from dtprob.inference.target import Inputs, Target
 from dtprob.models.arguments import Model
 from dtprob.models.axes import is_unnamed
-from dtprob.models.declaration import Declaration, declare, trace_model
+from dtprob.models.declaration import Declaration, declare
+from dtprob.models.execution import trace_model
 from dtprob.models.supported import differentiated_forwards
 from dtprob.testing.contract import expect, same
 

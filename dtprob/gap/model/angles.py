@@ -17,7 +17,8 @@ import numpyro.distributions as dist
 from numpyro.primitives import Messenger
 
 from dtprob.models.arguments import Data, Model, split_static, within
-from dtprob.models.declaration import innermost, trace_model
+from dtprob.models.declaration import innermost
+from dtprob.models.execution import trace_model
 
 _TURN: Final = 2 * math.pi
 _FLAT: Final = 1e-3

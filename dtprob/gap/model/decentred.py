@@ -21,7 +21,8 @@ from numpyro.infer.reparam import LocScaleReparam, Reparam
 
 from dtprob.effects.redrawn import Redrawn
 from dtprob.models.arguments import Data, Model, split_static, within
-from dtprob.models.declaration import base_constraint, trace_model
+from dtprob.models.declaration import base_constraint
+from dtprob.models.execution import trace_model
 from dtprob.wrapping import unwrapped
 
 _SCALED = {"loc", "scale"}

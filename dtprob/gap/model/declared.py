@@ -10,7 +10,8 @@ import equinox as eqx
 import jax
 
 from dtprob.models.arguments import Data, Model
-from dtprob.models.declaration import Declaration, trace_model
+from dtprob.models.declaration import Declaration
+from dtprob.models.execution import trace_model
 
 
 @dataclass(frozen=True)

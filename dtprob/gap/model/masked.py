@@ -12,7 +12,7 @@ from numpyro.primitives import Messenger
 
 from dtprob.effects.changing import is_scan
 from dtprob.models.arguments import Data, Model, within
-from dtprob.models.declaration import look_at_trace
+from dtprob.models.execution import look_at_trace
 from dtprob.wrapping import unwrapped, wrapped
 
 

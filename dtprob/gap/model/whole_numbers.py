@@ -17,7 +17,8 @@ from dtprob.effects.changing import Changing, Shift
 from dtprob.errors import InputError
 from dtprob.gap.observation import whiten
 from dtprob.models.arguments import Data, Model, split_static, within
-from dtprob.models.declaration import NOT_TRACED, is_factor, trace_model
+from dtprob.models.declaration import is_factor
+from dtprob.models.execution import NOT_TRACED, trace_model
 
 _SAME: Final = 1e-6
 """Relative change of what is observed that rounding may make."""

@@ -21,7 +21,7 @@ from dtprob.gap.next_measurement.design import Design, Prediction, Ranked, joine
 from dtprob.gap.observation import whiten
 from dtprob.gap.which.trials import Start
 from dtprob.models.arguments import Data, as_arrays
-from dtprob.models.declaration import trace_model
+from dtprob.models.execution import trace_model
 
 _SHOWN: Final = 5
 """Designs that a report lists."""

@@ -12,7 +12,8 @@ from dtprob.effects import catalogue
 from dtprob.effects.network import FAMILIES
 from dtprob.effects.network.laws import last_arrival, tilted
 from dtprob.effects.rewriting import Rewriting
-from dtprob.models.declaration import declare, trace_model
+from dtprob.models.declaration import declare
+from dtprob.models.execution import trace_model
 from dtprob.models.multi_access import multi_access, records
 from dtprob.testing import check_effect
 from tests.small_network import ARRIVAL, CLUSTERS, simulate

@@ -14,7 +14,8 @@ from numpyro.infer.reparam import CircularReparam
 
 from dtprob.errors import InputError
 from dtprob.models.arguments import model_name, select_arguments, split_static
-from dtprob.models.declaration import declare, metadata, model, trace_model
+from dtprob.models.declaration import declare, metadata, model
+from dtprob.models.execution import trace_model
 
 DATA = {"x": jnp.arange(6.0).reshape(3, 2), "degree": 2, "y": jnp.zeros((3, 2))}
 

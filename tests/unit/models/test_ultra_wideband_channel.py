@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from dtprob.errors import InputError
-from dtprob.models.declaration import declare, trace_model
+from dtprob.models.declaration import declare
+from dtprob.models.execution import trace_model
 from dtprob.models.ultra_wideband import link_power, rough_delay, ultra_wideband_channel
 from dtprob.raytracing import field, storage
 from dtprob.testing import check_model

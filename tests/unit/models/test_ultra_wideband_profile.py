@@ -11,7 +11,8 @@ from numpyro import handlers
 from dtprob.data.kinds import ChannelData
 from dtprob.effects import Rewriting, catalogue
 from dtprob.errors import InputError
-from dtprob.models.declaration import declare, trace_model
+from dtprob.models.declaration import declare
+from dtprob.models.execution import trace_model
 from dtprob.models.ultra_wideband import delay_profile, ultra_wideband_profile
 from dtprob.raytracing import field, storage
 from dtprob.testing import check_model
