@@ -118,8 +118,12 @@ def _channels(arrays: Arrays, *, matlab: bool) -> ChannelData:
         shape = "(link, snapshot, rx_antenna, tx_antenna, subcarrier)"
         raise InputError("channel", f"an array of shape {shape}", "nothing", "Add this array to the data")
     check_kind("channel", arrays["channel"], "complex")
-    if arrays["channel"].dtype.kind != "c":
-        remedy = "Store amplitude and phase, or received powers as 'power' for a model of powers"
+    if arrays["channel"].dtype.kind != "c" or (
+        arrays["channel"].any() and not np.imag(arrays["channel"]).any()
+    ):
+        remedy = (
+            "Store amplitude and phase, as amplitude * exp(1j * phase in rad), or received powers as 'power'"
+        )
         raise InputError("channel", "complex coefficients", "real numbers", remedy)
     if arrays["channel"].size and not arrays["channel"].any():
         raise InputError("channel", "measured coefficients", "zeros alone", "Store what was measured")
