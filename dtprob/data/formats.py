@@ -216,6 +216,7 @@ def _read_zarr(path: Path) -> Arrays:
 def _read_csv(path: Path) -> Arrays:
     import pandas as pd  # noqa: PLC0415  (slow to import, needed for tables only)
 
+    _check_text(path)
     first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
     header = [name.strip() for name in first]
     twice = sorted({name for name in header if name and header.count(name) > 1})
@@ -231,7 +232,8 @@ def _read_csv(path: Path) -> Arrays:
             str(path), "a row for each reading", "a header alone", "Write what was measured"
         ) from None
     if not all(pd.isna(cell) for cell in second[len(header) :]):
-        got, remedy = f"{len(second)} cells in the first row, {len(header)} names", "Name every column"
+        got = f"{len(second)} cells in the first row, {len(header)} names"
+        remedy = "Name every column in the first line, and write points in numbers"
         raise InputError(str(path), "a name for each column", got, remedy)
     _check_lengths(path, len(header))
     names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
@@ -242,6 +244,20 @@ def _read_csv(path: Path) -> Arrays:
     if absent:  # among words NA and None are words
         table[absent] = pd.read_csv(path, **layout, dtype=str, keep_default_na=False)[absent]
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
+
+
+def _check_text(path: Path) -> None:
+    """Refuse what is empty or no UTF-8."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            has_text = any(line.strip("\ufeff \t\r\n") for line in file)
+    except UnicodeDecodeError as error:
+        got = f"another encoding (byte {error.start})"
+        raise InputError(str(path), "a table in UTF-8", got, "Save it as UTF-8") from None
+    if not has_text:
+        raise InputError(
+            str(path), "a header and a row for each reading", "no text", "Write what was measured"
+        )
 
 
 def _check_lengths(path: Path, width: int) -> None:

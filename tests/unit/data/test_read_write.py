@@ -336,6 +336,10 @@ BAD_CHANNELS = {
         lambda a: {"channel": np.abs(a["channel"])},
         r"channel: expected complex coefficients, got real numbers\. Store amplitude and phase",
     ),
+    "angles alone": (
+        lambda a: {"channel": np.angle(a["channel"]) + 0j},
+        r"channel: expected complex coefficients, got real numbers\. Store amplitude and phase",
+    ),
     "nothing measured": (lambda a: {"channel": 0 * a["channel"]}, "channel: .* got zeros alone"),
     "words": (
         lambda a: {"channel": np.full(a["channel"].shape, "a")},
@@ -344,6 +348,10 @@ BAD_CHANNELS = {
     "one frequency": (
         lambda a: {"subcarrier_frequency": 0 * a["subcarrier_frequency"] + 5.0},
         r"subcarrier_frequency: expected different frequencies, got [0-9]+ within 0 Hz of 5 Hz",
+    ),
+    "megahertz": (
+        lambda a: {"subcarrier_frequency": np.arange(-2.0, 3.0)},
+        r"subcarrier_frequency: expected different frequencies, got 5 within 4 Hz .* in Hz \(not MHz",
     ),
 }
 
@@ -456,11 +464,15 @@ def test_bad_files_are_named(tmp_path):
         ("x,y,x\n1,2,3\n", "columns of different names, got 'x' twice"),
         ("x;y\n1;2\n", "columns that commas separate"),
         ("x\ty\n1\t2\n", "columns that commas separate"),
+        ("x,y\n1,5,-90,25\n", "got 4 cells in the first row, 2 names. .* points in numbers"),
+        ("", "expected a header and a row for each reading, got no text"),
+        (b"x,naive\n1,\xef\n", r"expected a table in UTF-8, got another encoding \(byte 10\)"),
+        ("x,y\n1,2\n".encode("utf-16"), r"expected a table in UTF-8, .* Save it as UTF-8"),
     ],
 )
 def test_tables_that_would_be_misread_are_refused(tmp_path, text, what):
     path = tmp_path / "table.csv"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=what):
         read_table(path)
 
