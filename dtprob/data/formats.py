@@ -97,6 +97,10 @@ def _read_hdf5(path: Path) -> Arrays:
 
     arrays: Arrays = {}
     with h5py.File(path, "r") as file:
+        groups = [name for name, item in file.items() if isinstance(item, h5py.Group) and name != "#refs#"]
+        if groups and len(groups) == len(file):
+            got, remedy = f"the group {groups[0]!r} alone", "Write the arrays at the top of the file"
+            raise InputError(str(path), "named arrays", got, remedy)
         for name, item in file.items():
             if not isinstance(item, h5py.Dataset) or _NETCDF_DIMENSION_ONLY in _attribute(item, "NAME"):
                 continue

@@ -407,6 +407,21 @@ def test_bad_powers_and_labels_are_named(tmp_path):
     arrays = power_arrays()
     with pytest.raises(InputError, match="power_reference: expected a value beside power_db"):
         read(save(tmp_path / "a.npz", {"power_db": arrays["power"], "rx_position": arrays["rx_position"]}))
+    dbm = {**arrays, "power": 10 * np.log10(arrays["power"] / 1e-3)}
+    with pytest.raises(
+        InputError, match=r"power: expected linear values from 0 up, .* as power_db, with power_reference"
+    ):
+        read(save(tmp_path / "e.npz", dbm))
+    levels = {**arrays, "power_db": dbm["power"]}
+    del levels["power"]
+    for reference in (0.0, -30.0):
+        with pytest.raises(
+            InputError, match=r"power_reference: expected a positive linear power .* 1e-3 for dBm"
+        ):
+            read(save(tmp_path / "f.npz", levels | {"power_reference": np.float64(reference)}))
+    levels["rssi"] = levels.pop("power_db")
+    with pytest.raises(InputError, match=r"array names .* power, power_db, .* got 'rssi'"):
+        read(save(tmp_path / "g.npz", levels))
     with pytest.raises(InputError, match="power: expected values from 0 up"):
         PowerData(**(arrays | {"power": -arrays["power"]}))
     with pytest.raises(InputError, match="y: expected at least one label"):
@@ -427,6 +442,13 @@ def test_the_first_word_among_labels_is_named(tmp_path):
     (tmp_path / "a.csv").write_text("x_0,y\n")
     with pytest.raises(InputError, match="expected a row for each reading, got a header alone"):
         read(tmp_path / "a.csv")
+
+
+def test_arrays_within_a_group_are_not_overlooked(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_group("campaign")["channel"] = np.ones(3)
+    with pytest.raises(InputError, match=r"got the group 'campaign' alone\. Write the arrays at the top"):
+        read(tmp_path / "a.h5")
 
 
 def test_features_of_other_lengths_are_named(tmp_path):
