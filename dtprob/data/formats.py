@@ -254,7 +254,9 @@ def _check_text(path: Path) -> None:
     """Refuse what is empty or no UTF-8."""
     try:
         with path.open(encoding="utf-8") as file:
-            has_text = any(line.strip("\ufeff \t\r\n") for line in file)
+            has_text = (
+                sum(bool(line.strip("\ufeff \t\r\n")) for line in file) > 0
+            )  # of all lines the encoding is seen
     except UnicodeDecodeError as error:
         got = f"another encoding (byte {error.start})"
         raise InputError(str(path), "a table in UTF-8", got, "Save it as UTF-8") from None

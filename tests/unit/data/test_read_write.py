@@ -489,6 +489,7 @@ def test_bad_files_are_named(tmp_path):
         ("x,y\n1,5,-90,25\n", "got 4 cells in the first row, 2 names. .* points in numbers"),
         ("", "expected a header and a row for each reading, got no text"),
         (b"x,naive\n1,\xef\n", r"expected a table in UTF-8, got another encoding \(byte 10\)"),
+        (b"x,y\n" + 9999 * b"1,2\n" + b"\xe9,2\n", "expected a table in UTF-8, got another encoding"),
         ("x,y\n1,2\n".encode("utf-16"), r"expected a table in UTF-8, .* Save it as UTF-8"),
     ],
 )
