@@ -305,7 +305,12 @@ def _section(content: Mapping[Any, Any], kind: type, where: str) -> Any:
     hints = get_type_hints(kind)
     for key in content:
         if key not in hints:
-            raise unknown_name(where, key, hints, "key")
+            error = unknown_name(where, key, hints, "key")
+            if "options" in hints:
+                hint = f"Settings stand under {where.rsplit(maxsplit=1)[-1][:-1]}.options]"
+                remedy = f"{error.remedy} {hint}" if error.remedy.endswith("?") else hint
+                error = InputError(error.what, error.expected, error.got, remedy)
+            raise error
     for entry in fields(kind):
         if entry.name not in content and entry.default is entry.default_factory is MISSING:
             raise InputError(where, f"a key '{entry.name}'", "none", f"Add {entry.name} = ...")

@@ -12,6 +12,7 @@ from dtprob import __version__
 from dtprob.case import load_case, read_document
 from dtprob.commands.progress import unread
 from dtprob.errors import InputError, nearest, raised_at
+from dtprob.files import let_go
 from dtprob.reproduce import FIGURES
 from dtprob.stopping import Stopping
 from dtprob.threads import one_thread
@@ -175,6 +176,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         except KeyboardInterrupt:
             resume = f" {_RESUMED.get(command, _GOES_ON)}" if "resume" in options else ""
             return _fail(INTERRUPTED, f"stopped.{resume}", debug=debug)
+        finally:
+            let_go()
 
 
 def _run(command: str, step: str, options: dict[str, Any], stopping: Stopping, *, debug: bool) -> int:

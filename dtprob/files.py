@@ -43,11 +43,17 @@ def write_text(path: str | os.PathLike[str], text: str) -> None:
         temporary.write_text(text, encoding="utf-8")
 
 
+_held: dict[Path, int] = {}
+"""Folders that this process writes results to, each with the open file that keeps other runs out."""
+
+
 def make_folder(out: Path) -> None:
     """Make the folder of the results, and try to write into it, before work that would be lost without it.
 
+    Other processes are refused it until `let_go`, or the end of this one.
+
     Raises:
-        InputError: a file of that name, or no permission.
+        InputError: a file of that name, no permission, or another run that writes there now.
     """
     try:
         out.mkdir(parents=True, exist_ok=True)
@@ -56,6 +62,32 @@ def make_folder(out: Path) -> None:
     except OSError as error:
         expected, got = "a folder that can be written to", error.strerror or str(error)
         raise InputError(f"--out {out}", expected, got, "Choose another folder") from None
+    _hold(out)
+
+
+def let_go() -> None:
+    """Let other runs write to the folders that this process has made."""
+    while _held:
+        os.close(_held.popitem()[1])
+
+
+def _hold(out: Path) -> None:
+    """Keep other processes out of a folder, where the system and the file system can."""
+    if os.name == "nt" or out.resolve() in _held:
+        return
+    import fcntl  # noqa: PLC0415  (Windows has none)
+
+    folder = os.open(out, os.O_RDONLY)
+    try:
+        fcntl.flock(folder, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        os.close(folder)
+        expected, got = "a folder that no other run writes to", "one that does"
+        raise InputError(f"--out {out}", expected, got, "Wait for it, or choose another folder") from None
+    except OSError:  # a file system without locks
+        os.close(folder)
+        return
+    _held[out.resolve()] = folder
 
 
 def check_apart(out: Path, results: Iterable[str], inputs: Iterable[Path]) -> None:

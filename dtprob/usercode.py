@@ -63,8 +63,11 @@ def _load_module(name: str, parts: list[str], folder: Path) -> ModuleType:
         if is_beside:
             _forget(parts[0], folder)
         elif _find(name) is None:
-            expected = f"a module beside the CASE file ({parts[-1]}.py) or one that is installed"
-            raise InputError(f"module {name}", expected, "none of that name", "Check the name and the folder")
+            expected = f"a module beside the CASE file ({'/'.join(parts)}.py) or one that is installed"
+            remedy = "Check the name and the folder"
+            if parts[-1] == "py":
+                remedy = f"Name the module without .py: '{name[:-3]}:...'"
+            raise InputError(f"module {name}", expected, "none of that name", remedy)
         try:
             return importlib.import_module(name)
         except Terminated:

@@ -40,7 +40,9 @@ def warn_of_miscompilation() -> None:
 
     if jax.default_backend() == "cpu":
         what = f"jaxlib {version()} miscompiles some products on CPUs, so results may be wrong"
-        remedy = f"Run `export XLA_FLAGS={FLAG}` before Python, or dtprob.configure() before the first array"
+        remedy = (
+            f"Run `export XLA_FLAGS={FLAG}` before Python, or dtprob.configure() right after `import dtprob`"
+        )
         warnings.warn(f"{what}. {remedy}.", RuntimeWarning, stacklevel=3)
 
 

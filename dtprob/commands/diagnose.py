@@ -95,7 +95,8 @@ def _settings(prepared: Prepared) -> Settings:
 
 def _diagnose(prepared: Prepared, reference: Posterior | None, job: Run) -> tuple[dict[str, Any], DataTree]:
     """The content of report.json and of gap.nc."""
-    job.say(f"{len(prepared.effects)} candidate effects")
+    count = len(prepared.effects)
+    job.say(f"{count} candidate effect{'' if count == 1 else 's'}")
     diagnosis = diagnose(
         prepared.model,
         prepared.data,

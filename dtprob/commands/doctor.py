@@ -54,21 +54,20 @@ def all_checks() -> Iterable[Check]:
     yield _package("infer and diagnose", "numpyro", "")
     yield _accelerator()
     yield _compiler()
-    sionna = _package("trace scenes", "sionna-rt", "raytracing")
+    sionna = _package("trace scenes", "sionna-rt")
     yield sionna
     if sionna.ok:
         yield _libllvm()
-    yield _package("multi-agent environments in PettingZoo's form", "pettingzoo", "control")
-    yield _package("read Zarr files", "zarr", "zarr")
+    yield _package("multi-agent environments in PettingZoo's form", "pettingzoo")
+    yield _package("read Zarr files", "zarr")
     yield _measured()
 
 
-def _package(ability: str, package: str, extra: str) -> Check:
+def _package(ability: str, package: str) -> Check:
     try:
         return Check(ability, ok=True, found=f"{package} {importlib.metadata.version(package)}")
     except importlib.metadata.PackageNotFoundError:
-        wanted = f"dtprob[{extra}]" if extra else "dtprob"
-        return Check(ability, ok=False, found=f"no {package}", remedy=f"pip install '{wanted}'")
+        return Check(ability, ok=False, found=f"no {package}", remedy=f"pip install {package}")
 
 
 def _accelerator() -> Check:

@@ -84,7 +84,9 @@ def from_dictionary(dataset: Mapping[str, Any]) -> PathSet:
     if missing:
         got = ", ".join(dataset)
         raise InputError("DeepMIMO dataset", f"a matrix '{missing[0]}'", got, "Load all matrices")
-    rx = np.asarray(dataset["rx_pos"], np.float64).reshape(-1, 3)
+    rx = np.asarray(dataset["rx_pos"], np.float64)
+    if rx.ndim != 2 or rx.shape[1] != 3:
+        raise InputError("DeepMIMO rx_pos", "shape (receiver, 3)", str(rx.shape), "Transpose it")
     tx = np.asarray(dataset["tx_pos"], np.float64).reshape(-1)
     if tx.shape != (3,):
         remedy = "Take the transmitters of a macro dataset one at a time"

@@ -66,7 +66,7 @@ def load_arrays(path: Path) -> Arrays:
 
 
 _UNNAMED = "column without a name, the {}th from 0"
-_EXTRA = {".zarr": "Install it with: pip install 'dtprob[zarr]'"}
+_EXTRA = {".zarr": "Install it with: pip install zarr"}
 """What brings the package that a format needs, of formats whose package does not come along."""
 
 
@@ -97,6 +97,10 @@ def _read_hdf5(path: Path) -> Arrays:
 
     arrays: Arrays = {}
     with h5py.File(path, "r") as file:
+        groups = [name for name, item in file.items() if isinstance(item, h5py.Group) and name != "#refs#"]
+        if groups and len(groups) == len(file):
+            got, remedy = f"the group {groups[0]!r} alone", "Write the arrays at the top of the file"
+            raise InputError(str(path), "named arrays", got, remedy)
         for name, item in file.items():
             if not isinstance(item, h5py.Dataset) or _NETCDF_DIMENSION_ONLY in _attribute(item, "NAME"):
                 continue
@@ -216,6 +220,7 @@ def _read_zarr(path: Path) -> Arrays:
 def _read_csv(path: Path) -> Arrays:
     import pandas as pd  # noqa: PLC0415  (slow to import, needed for tables only)
 
+    _check_text(path)
     first = pd.read_csv(path, header=None, nrows=1, dtype=str, keep_default_na=False).iloc[0]
     header = [name.strip() for name in first]
     twice = sorted({name for name in header if name and header.count(name) > 1})
@@ -231,7 +236,8 @@ def _read_csv(path: Path) -> Arrays:
             str(path), "a row for each reading", "a header alone", "Write what was measured"
         ) from None
     if not all(pd.isna(cell) for cell in second[len(header) :]):
-        got, remedy = f"{len(second)} cells in the first row, {len(header)} names", "Name every column"
+        got = f"{len(second)} cells in the first row, {len(header)} names"
+        remedy = "Name every column in the first line, and write points in numbers"
         raise InputError(str(path), "a name for each column", got, remedy)
     _check_lengths(path, len(header))
     names = [name or _UNNAMED.format(i) for i, name in enumerate(header)]
@@ -242,6 +248,22 @@ def _read_csv(path: Path) -> Arrays:
     if absent:  # among words NA and None are words
         table[absent] = pd.read_csv(path, **layout, dtype=str, keep_default_na=False)[absent]
     return _columns(table.drop(columns=[name for name in unnamed if bool(table[name].isna().all())]))
+
+
+def _check_text(path: Path) -> None:
+    """Refuse what is empty or no UTF-8."""
+    try:
+        with path.open(encoding="utf-8") as file:
+            has_text = (
+                sum(bool(line.strip("\ufeff \t\r\n")) for line in file) > 0
+            )  # of all lines the encoding is seen
+    except UnicodeDecodeError as error:
+        got = f"another encoding (byte {error.start})"
+        raise InputError(str(path), "a table in UTF-8", got, "Save it as UTF-8") from None
+    if not has_text:
+        raise InputError(
+            str(path), "a header and a row for each reading", "no text", "Write what was measured"
+        )
 
 
 def _check_lengths(path: Path, width: int) -> None:

@@ -105,7 +105,7 @@ class ChannelData(_OfLinks):
 
     Raises:
         InputError: arrays that do not fit together, NaN or infinity, a noise power that is not positive, subcarriers all at
-            one frequency or within 1 Hz (frequencies in GHz).
+            one frequency or within 1 kHz (frequencies in MHz, or numbered).
     """
 
     channel: Complex[np.ndarray, "link snapshot rx_antenna tx_antenna subcarrier"]

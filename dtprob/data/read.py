@@ -106,6 +106,8 @@ def _interpret(arrays: Arrays, options: Mapping[str, Any], *, matlab: bool) -> D
     if "y" in names and names & {"x", "x_0"}:
         return _labels(arrays, matlab=matlab)
     if names & set(CHANNEL_ARRAYS):
+        for name in names - _CANONICAL:
+            raise unknown_name("array", name, _CANONICAL, "array name")
         return _channels(arrays, matlab=matlab)
     return Table(_columns(arrays, matlab=matlab))
 
@@ -118,8 +120,12 @@ def _channels(arrays: Arrays, *, matlab: bool) -> ChannelData:
         shape = "(link, snapshot, rx_antenna, tx_antenna, subcarrier)"
         raise InputError("channel", f"an array of shape {shape}", "nothing", "Add this array to the data")
     check_kind("channel", arrays["channel"], "complex")
-    if arrays["channel"].dtype.kind != "c":
-        remedy = "Store amplitude and phase, or received powers as 'power' for a model of powers"
+    if arrays["channel"].dtype.kind != "c" or (
+        arrays["channel"].any() and not np.imag(arrays["channel"]).any()
+    ):
+        remedy = (
+            "Store amplitude and phase, as amplitude * exp(1j * phase in rad), or received powers as 'power'"
+        )
         raise InputError("channel", "complex coefficients", "real numbers", remedy)
     if arrays["channel"].size and not arrays["channel"].any():
         raise InputError("channel", "measured coefficients", "zeros alone", "Store what was measured")
@@ -144,11 +150,20 @@ def _powers(arrays: Arrays, *, matlab: bool) -> PowerData:
             raise InputError(
                 "power_reference", "one number", f"shape {reference.shape}", "Give the power of 0 dB"
             )
+        if not reference.item() > 0:
+            expected, remedy = "a positive linear power (W), that of 0 dB", "Give 1e-3 for dBm, 1 for a ratio"
+            raise InputError("power_reference", expected, f"{reference.item():g}", remedy)
         arrays["power"] = reference.item() * 10.0 ** (np.asarray(decibels, dtype=float) / 10.0)
     valid = [*POWER_ARRAYS, "power_db", "power_reference"]
     for name in arrays:
         if name not in POWER_ARRAYS:
             raise unknown_name("array", name, valid, "array name")
+    given = arrays.get("power")
+    if given is not None and given.dtype.kind in "fiu" and (given < 0).any():
+        remedy = (
+            "Give levels in dB as power_db, with power_reference, the linear power (W) of 0 dB: 1e-3 for dBm"
+        )
+        raise InputError("power", "linear values from 0 up", f"{given.min():g}", remedy)
     return PowerData(**_canonical(arrays, POWER_ARRAYS, matlab=matlab))
 
 

@@ -7,8 +7,8 @@ from jaxtyping import Float
 
 from dtprob.errors import InputError
 
-_NARROWEST: Final = 1.0
-"""A span below this, in Hz, is one of numbers in GHz or of indices by mistake."""
+_NARROWEST: Final = 1e3
+"""A span below this, in Hz, is one of numbers in GHz or MHz, or of indices, by mistake."""
 
 
 def check_tones(frequency: Float[np.ndarray, " subcarrier"], carrier: float | None = None) -> None:
@@ -19,11 +19,11 @@ def check_tones(frequency: Float[np.ndarray, " subcarrier"], carrier: float | No
         carrier: in Hz, where it is known.
 
     Raises:
-        InputError: several at one frequency or within 1 Hz, or frequencies that count from zero.
+        InputError: several at one frequency or within 1 kHz, or frequencies that count from zero.
     """
     if len(frequency) > 1 and np.ptp(frequency) < _NARROWEST:
         got = f"{len(frequency)} within {np.ptp(frequency):g} Hz of {frequency[0]:g} Hz"
-        remedy = "Give each subcarrier's own frequency, in Hz from the carrier"
+        remedy = "Give each subcarrier's own frequency in Hz (not MHz or its number), from the carrier"
         raise InputError("subcarrier_frequency", "different frequencies", got, remedy)
     if carrier is not None and len(frequency) and frequency.min() > carrier / 2:
         expected, got = f"Hz from the carrier, {carrier:g} Hz", f"{frequency.min():g} Hz and more"

@@ -13,6 +13,7 @@ Source: the layout as public readers of the format describe it (DeepMIMO's conve
 
 import os
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -138,4 +139,6 @@ def _read_path(lines: _Lines) -> _Path:
     if len(steps) - 2 != int(values[1]):
         raise lines.wrong(expected, chain)
     points = [lines.numbers(3, "the coordinates of a point") for _ in steps]
+    if any(one == next_ for one, next_ in pairwise(points)):
+        raise lines.wrong("points that differ from one to the next", " ".join(map(str, points[-1])))
     return _Path(values[2], values[3], values[4], np.asarray(points))

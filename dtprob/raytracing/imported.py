@@ -10,6 +10,14 @@ from scipy.constants import speed_of_light
 from dtprob.errors import InputError
 from dtprob.raytracing.paths import PathSet, validate
 
+_LEAST_CARRIER: Final = 1e6
+"""Carriers below this, in Hz, are numbers in GHz or MHz by mistake."""
+_LONGEST: Final = 1e4
+"""A link's shortest path is no longer than this many straight lines, or as many metres where that is more."""
+_STRAIGHT: Final = 1e-3
+"""Excess length, in m, below which a path is the straight line, and met no wall beside an end either."""
+_ALONG: Final = 0.995
+"""Least cosine of the angle between a straight path's direction and the line between the ends."""
 MATERIAL: Final = "imported"
 """Name of the one object and its material, on which no gain depends."""
 
@@ -48,13 +56,13 @@ def path_set(imported: ImportedPaths, frequency: float, provenance: tuple[tuple[
         provenance: where the paths come from.
 
     Raises:
-        InputError: no path at all, a delay that is not positive, or such a carrier.
+        InputError: no path at all, a gain above 0 dB, a delay that is not positive or does not fit the places of the
+            ends, a straight path whose directions do not, or such a carrier.
     """
     mask = imported.mask
-    if not frequency > 0:
-        raise InputError(
-            "carrier of the imported paths", "a positive frequency in Hz", f"{frequency:g}", "Give it in Hz"
-        )
+    if not frequency >= _LEAST_CARRIER:
+        expected = "a frequency in Hz, such as 3.5e9"
+        raise InputError("carrier of the imported paths", expected, f"{frequency:g}", "Give it in Hz")
     if not mask.any():
         raise InputError("imported paths", "a path or more", "none", "Export links that are reached")
     delay = np.where(mask, imported.delay, 0.0).astype(np.float64)
@@ -64,6 +72,7 @@ def path_set(imported: ImportedPaths, frequency: float, provenance: tuple[tuple[
             "delays of the imported paths", "positive values in s", got, "Export absolute delays"
         )
     length = np.where(mask, delay * speed_of_light, 1.0)
+    _check_geometry(imported, length)
     carrier = np.exp(-2j * np.pi * np.mod(frequency * delay, 1.0))
     spreading = speed_of_light / frequency / (4 * np.pi * length)
     wanted = np.where(mask, imported.coefficient, 0) / carrier / spreading
@@ -97,6 +106,36 @@ def path_set(imported: ImportedPaths, frequency: float, provenance: tuple[tuple[
             provenance=provenance,
         )
     )
+
+
+def _check_geometry(imported: ImportedPaths, length: Float[np.ndarray, "link path"]) -> None:
+    """Refuse paths that cannot be between their ends, as where a unit or an axis is another one."""
+    mask, ahead = imported.mask, imported.rx_position - imported.tx_position
+    apart = np.linalg.norm(ahead, axis=1)
+    strongest = np.abs(np.where(mask, imported.coefficient, 0)).max()
+    if strongest > 1:
+        got, remedy = f"{20 * np.log10(strongest):.3g} dB", "Give powers in dB of the power that was sent"
+        raise InputError("gains of the imported paths", "0 dB or less", got, remedy)
+    shortest = np.where(mask, length, np.inf).min(axis=1)
+    longest = _LONGEST * np.maximum(apart, 1.0)
+    wrong = np.flatnonzero((shortest < apart * (1 - 1e-2)) | (np.isfinite(shortest) & (shortest > longest)))
+    if wrong.size:
+        link = int(wrong[0])
+        expected = (
+            f"paths no shorter than the {apart[link]:.4g} m between the ends of link {link}, and of its order"
+        )
+        remedy = "Check the units of delays (s) and positions (m), and the axes of positions"
+        raise InputError("delays of the imported paths", expected, f"{shortest[link]:.4g} m", remedy)
+    straight = mask & (length < apart[:, None] + _STRAIGHT) & (apart[:, None] > 1.0)
+    for name, direction in (("departure", imported.departure), ("arrival", imported.arrival)):
+        along = np.sum(direction * ahead[:, None], axis=-1) / np.maximum(apart, 1.0)[:, None]
+        off = np.argwhere(straight & (along < _ALONG))
+        if len(off):
+            link, path = map(int, off[0])
+            got = f"{np.rad2deg(np.arccos(along[link, path])):.0f} deg from it for path {path} of link {link}"
+            expected = "that of the straight line for a path as long as it"
+            remedy = "Check the units of angles (deg) and where they count from"
+            raise InputError(f"direction of {name} of the imported paths", expected, got, remedy)
 
 
 def unit_vector(

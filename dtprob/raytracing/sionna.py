@@ -18,6 +18,6 @@ def sionna_rt() -> Any:
     except ModuleNotFoundError as error:
         if error.name not in {"sionna", "sionna.rt", "mitsuba", "drjit"}:
             raise
-        remedy = "Install it with `pip install 'dtprob[raytracing]'`, or use a path set traced elsewhere"
+        remedy = "Install it with `pip install sionna-rt`, or use a path set traced elsewhere"
         raise InputError("ray tracer", "the package sionna-rt", f"no module {error.name}", remedy) from error
     return rt

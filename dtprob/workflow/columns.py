@@ -7,6 +7,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+import numpy as np
+
 from dtprob.errors import InputError, nearest
 from dtprob.models.arguments import Data, Model, lacking
 from dtprob.models.indices import check_indices
@@ -22,7 +24,7 @@ def check_columns(file: Path, model: Model, arguments: Data, columns: Iterable[s
         columns: names of the table's columns.
 
     Raises:
-        InputError: a column is missing or spelt otherwise, or an index in one is beyond an array's end.
+        InputError: a column is missing, empty or spelt otherwise, or an index in one is beyond an array's end.
     """
     there = list(columns)
     for name in lacking(model, arguments):
@@ -35,6 +37,10 @@ def check_columns(file: Path, model: Model, arguments: Data, columns: Iterable[s
         spelt = strange.get(_plain(name)) if name not in arguments else None
         if spelt is not None:
             raise InputError(file.name, f"a column {name!r}", repr(spelt), f"Rename {spelt!r} there")
+    for name in there:
+        if name in takes and np.size(arguments[name]) == 0:
+            expected, remedy = "a value or more", "Write what was measured"
+            raise InputError(f"{file.name}, column {name!r}", expected, "none", remedy)
     check_indices(model, arguments, f"{file.name}, column")
 
 

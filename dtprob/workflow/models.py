@@ -21,6 +21,7 @@ class Entry:
             options by name, to the arguments; its options can stand in [model.options] beside the model's.
         reduce: for a model that sees statistics of the data and not the data, the function "module:function" from the
             data and the arguments so far, by name, to the arguments that they become.
+        diagnosed_by: for a model whose density is none of the data, the model that a diagnosis takes instead.
     """
 
     function: str
@@ -28,6 +29,7 @@ class Entry:
     derived: Mapping[str, str] = field(default_factory=dict)
     arrange: str | None = None
     reduce: str | None = None
+    diagnosed_by: str | None = None
 
     def load(self) -> Model:
         """The model itself."""
@@ -84,6 +86,7 @@ MODELS: Mapping[str, Entry] = {
         "dtprob.models.prediction_powered.generalised:prediction_powered",
         Labels,
         arrange="dtprob.models.prediction_powered.label_data:label_data",
+        diagnosed_by="label_twin",
     ),
 }
 """The models that a CASE can name."""

@@ -100,6 +100,11 @@ def prepare(
     case = dataclasses.replace(case, data=dataclasses.replace(case.data, file=located(case.data.file)))
     engine = make_engine(case.engine, f"{case.path.name} [engine]")
     model = _model(case)
+    other = MODELS[case.model.name].diagnosed_by if case.model.name in MODELS else None
+    if need == "diagnosis" and other is not None:
+        expected = f"a model of the data to diagnose, such as {other}"
+        remedy = f'Set name = "{other}", which asks where the predictor errs'
+        raise InputError(f"{case.path.name} [model] name", expected, case.model.name, remedy)
     if case.scene is not None and "paths" not in inspect.signature(model).parameters:
         expected, remedy = (
             "a model that takes paths, such as ray_traced_channel",

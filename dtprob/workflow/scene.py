@@ -24,10 +24,13 @@ from dtprob.errors import InputError
 from dtprob.raytracing import storage
 from dtprob.raytracing.beyond import strongest, with_beyond
 from dtprob.raytracing.paths import PathSet
+from dtprob.workflow.plausible import doubts, strayed
 
 _WALL_THICKNESS = 0.12
 _APART = 1e-2
 """Ends closer than this, in m, cannot be traced."""
+_LEAST_CARRIER = 1e6
+"""Carriers below this, in Hz, are numbers in GHz or MHz by mistake."""
 _MOST_BEYOND = 64
 """Paths of another trace that are kept for each link where the case does not say."""
 _MOST_ELSEWHERE = 8
@@ -62,6 +65,8 @@ def reached[Links: ChannelData | PowerData](
         InputError: see `paths_of`; or a link that no path reaches, unless the case asks to skip it.
     """
     paths = paths_of(case, data, cache, say)
+    for doubt in doubts(data, paths.frequency):
+        say(f"note: {doubt}")
     found = np.asarray(paths.mask).any(axis=1)
     if found.all():
         return data, paths
@@ -100,6 +105,9 @@ def paths_of(
         if isinstance(data, ChannelData):
             check_tones(data.subcarrier_frequency, paths.frequency)
         return paths
+    if scene.frequency is not None and scene.frequency < _LEAST_CARRIER:
+        where, got = f"{case.path.name} [scene] frequency", f"{scene.frequency:g}"
+        raise InputError(where, "the carrier in Hz, such as 3.5e9", got, "Write it in Hz")
     if scene.frequency is not None and isinstance(data, ChannelData):
         check_tones(data.subcarrier_frequency, scene.frequency)
     kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
@@ -107,7 +115,7 @@ def paths_of(
         say(f"taking the paths that were traced before, {kept.name}")
         return storage.load(kept)
     say(f"tracing {len(data.rx_position)} links through {Path(scene.file).name}")
-    paths = _trace(scene, _placed(scene, data))
+    paths = _trace(scene, _placed(scene, data), say)
     if kept is not None:
         storage.save(paths, kept)
     return paths
@@ -171,9 +179,11 @@ def _check_traced(scene: SceneSection, paths: PathSet, case: Case, say: Callable
         say(f"note: {Path(scene.file).name} was traced before: [scene] {', '.join(given)} changes nothing")
 
 
-def _trace(scene: SceneSection, data: ChannelData | PowerData) -> PathSet:
+def _trace(scene: SceneSection, data: ChannelData | PowerData, say: Callable[[str], None]) -> PathSet:
     """The twin's paths, and apart from them those of the traces that the case wants for a check."""
     traced = _Traced(scene, _load(scene, float(scene.frequency or 0.0)), data)
+    for doubt in strayed(data, traced.scene):
+        say(f"note: {doubt}")
     paths = traced.paths(scene.max_depth, refraction=scene.refraction)
     fuller: dict[str, PathSet] = {}
     if scene.check_depth is not None:

@@ -111,7 +111,11 @@ BAD = {
     ),
     "key": (
         f'{SHORT}[engine]\nnme = "nuts"\n',
-        r"case\.toml \[engine\]: expected one of the keys .*'nme'\. Did you mean 'name'\?",
+        r"case\.toml \[engine\]: expected one of the keys .*'nme'\. Did you mean 'name'\? Settings stand under",
+    ),
+    "settings beside options": (
+        f'{SHORT}[engine]\nname = "nuts"\ndraws = 100\n',
+        r"got 'draws'\. Settings stand under \[engine\.options\]\.",
     ),
     "key far from all": (f"{SHORT}[seed]\nqqq = 1\n", r"got 'qqq'\. Use a valid key\."),
     "no model": ('[data]\nfile = "a.npz"\n', r"expected a section \[model\], got none"),
@@ -206,6 +210,7 @@ def test_mistakes_in_own_modules_are_named(tmp_path):
         "own_absent:model": r"module own_absent: expected a module beside the CASE file \(own_absent\.py\)",
         "own_broken:model": "expected a module that runs, got ZeroDivisionError: division by zero",
         "own_leaving:model": "expected a module that runs, got SystemExit: no data. Correct",
+        "own_named.py:model": r"Name the module without \.py: 'own_named:\.\.\.'",
         "own_named:mymodel": r"got 'mymodel'\. Did you mean 'my_model'\?",
         "own_named:": "expected 'package.module:function'",
         "../own_named:my_model": "expected 'package.module:function'",

@@ -3,6 +3,8 @@
 import re
 from pathlib import Path
 
+import pytest
+
 TEXT = (Path(__file__).parents[2] / "docs" / "declaring.md").read_text()
 
 
@@ -15,3 +17,10 @@ def test_a_model_and_effects_of_ones_own(capsys):
     assert "dB/m" in said
     size = names["found"].causes[0].size[0]  # pyright: ignore[reportAttributeAccessIssue]
     assert size.low < -0.4 < size.high
+
+
+@pytest.mark.parametrize("page", ["declaring", "ray_tracing"])
+def test_jax_is_set_up_before_a_part_of_dtprob_starts_it(page):
+    text = (Path(__file__).parents[2] / "docs" / f"{page}.md").read_text()
+    code = "".join(re.findall(r"```python\n(.*?)```", text, re.DOTALL))
+    assert code.index("dtprob.configure()") < code.index("from dtprob.")

@@ -165,6 +165,24 @@ def test_wrong_deepmimo_input_is_named(tmp_path):
         read_scenario(tmp_path, "t001_tx001_r002")
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"rt_params": {"frequency": CARRIER / 1e9}}, r"a frequency in Hz, such as 3\.5e9, got"),
+        ({"delay": 1e9 * dataset()["delay"]}, "delays of the imported paths: .* Check the units"),
+        ({"delay": 1e6 * dataset()["delay"]}, "delays of the imported paths: .* Check the units"),
+        ({"rx_pos": 1e2 * RX}, "delays of the imported paths: .* Check the units"),
+        ({"rx_pos": RX.T}, r"rx_pos: expected shape \(receiver, 3\), got \(3, 2\)"),
+        ({"power": 10 ** (dataset()["power"] / 10)}, "gains of the imported paths: expected 0 dB or less"),
+        ({"aod_az": np.deg2rad(dataset()["aod_az"])}, "direction of departure .* Check the units of angles"),
+        ({"aoa_az": dataset()["aoa_az"] + 180}, "direction of arrival .* Check the units of angles"),
+    ],
+)
+def test_other_units_and_axes_of_imported_paths_are_refused(change, message):
+    with pytest.raises(InputError, match=message):
+        from_dictionary(dataset() | change)
+
+
 def p2m(transmit_power=0.0):
     """The text of a .paths.p2m file, with a third receiver that nothing reaches."""
     lines = [f"# {text}" for text in ("<paths>", "receiver, number of paths", "power phase delay ...")]
@@ -205,6 +223,7 @@ def test_a_p2m_file_gives_its_channel(tmp_path, transmit_power):
         (7, "Tx-Q-Rx", "line 8: expected a chain of 0 interactions"),
         (7, "Tx-R-Rx", "line 8: expected a chain of 0 interactions"),
         (8, "1.0 2.0", "line 9: expected the coordinates of a point"),
+        (9, " ".join(f"{entry:.9f}" for entry in TX), "line 10: expected points that differ"),
     ],
 )
 def test_a_damaged_p2m_line_is_named(tmp_path, line, text, message):
@@ -221,7 +240,7 @@ def test_comments_of_a_p2m_file_may_be_of_any_encoding(tmp_path):
     file = tmp_path / "street.paths.t001_01.r002.p2m"
     file.write_bytes(b"\xef\xbb\xbf# angles in \xb0\n" + "\n".join(p2m()).encode())
     check(read_p2m(file, CARRIER))
-    with pytest.raises(InputError, match="a positive frequency in Hz, got 0"):
+    with pytest.raises(InputError, match=r"a frequency in Hz, such as 3\.5e9, got 0\."):
         read_p2m(file, 0.0)
 
 

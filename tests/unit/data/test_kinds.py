@@ -12,7 +12,7 @@ HERE = np.arange(9.0).reshape(3, 3)
 def test_some_links(noise):
     arrays = {"rx_position": HERE, "tx_position": -HERE, "noise_power": noise}
     channel = np.arange(3)[:, None, None, None, None] * np.ones((3, 1, 1, 1, 3)) + 0j
-    band = np.array([-1.0, 0.0, 1.0])  # as many subcarriers as links
+    band = np.array([-1e6, 0.0, 1e6])  # as many subcarriers as links
     found = ChannelData(channel=channel, subcarrier_frequency=band, **arrays).take(np.array([2, 0]))
     np.testing.assert_array_equal(found.channel[:, 0, 0, 0, 0], [2, 0])
     np.testing.assert_array_equal(found.subcarrier_frequency, band)

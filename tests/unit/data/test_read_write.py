@@ -337,6 +337,10 @@ BAD_CHANNELS = {
         lambda a: {"channel": np.abs(a["channel"])},
         r"channel: expected complex coefficients, got real numbers\. Store amplitude and phase",
     ),
+    "angles alone": (
+        lambda a: {"channel": np.angle(a["channel"]) + 0j},
+        r"channel: expected complex coefficients, got real numbers\. Store amplitude and phase",
+    ),
     "nothing measured": (lambda a: {"channel": 0 * a["channel"]}, "channel: .* got zeros alone"),
     "words": (
         lambda a: {"channel": np.full(a["channel"].shape, "a")},
@@ -345,6 +349,10 @@ BAD_CHANNELS = {
     "one frequency": (
         lambda a: {"subcarrier_frequency": 0 * a["subcarrier_frequency"] + 5.0},
         r"subcarrier_frequency: expected different frequencies, got [0-9]+ within 0 Hz of 5 Hz",
+    ),
+    "megahertz": (
+        lambda a: {"subcarrier_frequency": np.arange(-2.0, 3.0)},
+        r"subcarrier_frequency: expected different frequencies, got 5 within 4 Hz .* in Hz \(not MHz",
     ),
 }
 
@@ -400,6 +408,21 @@ def test_bad_powers_and_labels_are_named(tmp_path):
     arrays = power_arrays()
     with pytest.raises(InputError, match="power_reference: expected a value beside power_db"):
         read(save(tmp_path / "a.npz", {"power_db": arrays["power"], "rx_position": arrays["rx_position"]}))
+    dbm = {**arrays, "power": 10 * np.log10(arrays["power"] / 1e-3)}
+    with pytest.raises(
+        InputError, match=r"power: expected linear values from 0 up, .* as power_db, with power_reference"
+    ):
+        read(save(tmp_path / "e.npz", dbm))
+    levels = {**arrays, "power_db": dbm["power"]}
+    del levels["power"]
+    for reference in (0.0, -30.0):
+        with pytest.raises(
+            InputError, match=r"power_reference: expected a positive linear power .* 1e-3 for dBm"
+        ):
+            read(save(tmp_path / "f.npz", levels | {"power_reference": np.float64(reference)}))
+    levels["rssi"] = levels.pop("power_db")
+    with pytest.raises(InputError, match=r"array names .* power, power_db, .* got 'rssi'"):
+        read(save(tmp_path / "g.npz", levels))
     with pytest.raises(InputError, match="power: expected values from 0 up"):
         PowerData(**(arrays | {"power": -arrays["power"]}))
     with pytest.raises(InputError, match="y: expected at least one label"):
@@ -420,6 +443,13 @@ def test_the_first_word_among_labels_is_named(tmp_path):
     (tmp_path / "a.csv").write_text("x_0,y\n")
     with pytest.raises(InputError, match="expected a row for each reading, got a header alone"):
         read(tmp_path / "a.csv")
+
+
+def test_arrays_within_a_group_are_not_overlooked(tmp_path):
+    with h5py.File(tmp_path / "a.h5", "w") as file:
+        file.create_group("campaign")["channel"] = np.ones(3)
+    with pytest.raises(InputError, match=r"got the group 'campaign' alone\. Write the arrays at the top"):
+        read(tmp_path / "a.h5")
 
 
 def test_features_of_other_lengths_are_named(tmp_path):
@@ -457,11 +487,16 @@ def test_bad_files_are_named(tmp_path):
         ("x,y,x\n1,2,3\n", "columns of different names, got 'x' twice"),
         ("x;y\n1;2\n", "columns that commas separate"),
         ("x\ty\n1\t2\n", "columns that commas separate"),
+        ("x,y\n1,5,-90,25\n", "got 4 cells in the first row, 2 names. .* points in numbers"),
+        ("", "expected a header and a row for each reading, got no text"),
+        (b"x,naive\n1,\xef\n", r"expected a table in UTF-8, got another encoding \(byte 10\)"),
+        (b"x,y\n" + 9999 * b"1,2\n" + b"\xe9,2\n", "expected a table in UTF-8, got another encoding"),
+        ("x,y\n1,2\n".encode("utf-16"), r"expected a table in UTF-8, .* Save it as UTF-8"),
     ],
 )
 def test_tables_that_would_be_misread_are_refused(tmp_path, text, what):
     path = tmp_path / "table.csv"
-    path.write_text(text)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(InputError, match=what):
         read_table(path)
 

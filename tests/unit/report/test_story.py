@@ -86,6 +86,12 @@ def test_detectable_sizes_of_a_family_are_its_worst() -> None:
     assert (first.name, first.size, first.count) == ("shift", "5.0\u202fcm", 2)
     assert first.sizes == "2.0\u202fcm to 5.0\u202fcm"
     assert (second.name, second.size, second.sizes, second.count) == ("other", "0.10", "0.10", 1)
+    beyond: list[Detectable] = [
+        {"effect": "turn[a]", "size": 14.0, "parameter": "rotation", "unit": "rad"},
+        {"effect": "missing[a]", "size": 0.5, "parameter": "fraction"},
+        {"effect": "missing[b]", "size": 1.5, "parameter": "fraction"},
+    ]
+    assert [entry.sizes for entry in detectable_families(beyond)] == ["not at all", "0.50 to not at all"]
     (ratio,) = detectable_families([{"effect": "noise", "size": 0.03, "parameter": "log_ratio"}])
     assert (ratio.parameter, ratio.size) == ("factor of ratio", "1.030")
 

@@ -64,6 +64,15 @@ def test_an_index_beyond_the_end_is_told_with_the_table(tmp_path):
         prepare(case(tmp_path, rows=ROWS + "\n12.0,3,-61.0"), need="fit")
 
 
+def test_an_array_without_a_value_is_named(tmp_path):
+    made = case(tmp_path)
+    none = {"distance": np.zeros(0), "site": np.zeros(0, int), "level": np.zeros(0)}
+    np.savez(tmp_path / "t.npz", **none)
+    (tmp_path / "case.toml").write_text(CASE.format(more="").replace("t.csv", "t.npz"))
+    with pytest.raises(InputError, match=r"t\.npz, column 'distance': expected a value or more, got none"):
+        prepare(load_case(made.path), need="fit")
+
+
 def test_designs_need_no_observed_column(tmp_path):
     (tmp_path / "elsewhere.csv").write_text("distance,site\n20.0,0\n30.0,1\n")
     found = prepare(case(tmp_path, more='designs = "elsewhere.csv"'), need="diagnosis").designs

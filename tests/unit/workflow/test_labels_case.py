@@ -241,3 +241,10 @@ def test_fit_says_that_it_is_erm_without_unlabelled_rows(tmp_path, capsys):
         assert main(["fit", str(file), "--out", str(tmp_path / "out")]) == 0
     told = capsys.readouterr()
     assert "There are no unlabelled samples with predictions, so this is plain ERM." in told.out + told.err
+
+
+def test_a_diagnosis_asks_for_the_model_of_the_labels(tmp_path):
+    example(tmp_path)
+    message = r"\[model\] name: .* got prediction_powered\. Set name = \"label_twin\", which asks where"
+    with pytest.raises(InputError, match=message):
+        prepare(load_case(tmp_path / "case.toml"), need="diagnosis")

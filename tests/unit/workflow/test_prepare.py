@@ -117,7 +117,7 @@ def tracing(folder, monkeypatch):
 
     traced = []
 
-    def fake_trace(section, data):
+    def fake_trace(section, data, say):
         traced.append(section.file)
         return storage.load(folder / "paths.nc")
 
