@@ -51,7 +51,7 @@ def run(*, json: bool) -> None:
 
 def all_checks() -> Iterable[Check]:
     """Every check, without loading a ray tracer."""
-    yield _package("infer and diagnose", "numpyro", "")
+    yield _package("infer and diagnose", "numpyro")
     yield _accelerator()
     yield _compiler()
     sionna = _package("trace scenes", "sionna-rt")
