@@ -80,16 +80,16 @@ def array_calibration(sites: Sites, _data: Data) -> list[Effect]:
 
             def weigh(value: Any, p: Mapping[str, Any], _: Mapping[str, Any], index: int = index) -> Any:
                 own = jnp.arange(value.shape[-1]) == index
-                return jnp.where(own, value * _gain(p["log_gain"], p["phase"]), value)
+                return jnp.where(own, value * (1 - p["fraction"]) * phasor(p["phase"]), value)
 
             effects.append(
                 Effect(
                     "array_calibration",
                     {f"{side}_response": weigh},
-                    (normal("log_gain", 0.2, "Np"), normal("phase", 0.5, "rad")),
+                    (normal("fraction", 0.7), normal("phase", 0.5, "rad")),
                     instance=name,
-                    physics=f"Complex gain of {side} element {index} differs from that of the others.",
-                    source="exp(g + j phi) on one element's response.",
+                    physics=f"Element {index} of the {side} array lacks this share of its amplitude (1: it is dead).",
+                    source="(1 - s) exp(j phi) on one element's response.",
                 )
             )
     return effects

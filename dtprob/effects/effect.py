@@ -56,7 +56,10 @@ class Parameter:
     labels: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        """Check that each entry has its label, what is tried is one place, and no size can only be below its null."""
+        """Check its unit and labels, that what is tried is one place, and that no size can only be below its null."""
+        if not isinstance(self.unit, str):
+            remedy = 'Write "1" for a pure number.'
+            raise InputError(f"unit of parameter {self.name}", "text", repr(self.unit), remedy)
         if self.labels and len(self.labels) != self.size:
             got = f"{len(self.labels)}"
             raise InputError(

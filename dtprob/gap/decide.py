@@ -63,10 +63,11 @@ def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) ->
 
 
 def _leaves_moments(evidence: Evidence, level: float) -> bool:
-    """Whether all that is left is how observations spread, of which what moves only expectations is no imitation."""
+    """Whether all that is left is how observations spread, of which causes that move expectations are no imitation."""
     left = [s for s in evidence.after.sites if s.p_value <= level and not s.last]
     locating = evidence.steps[0].view.screening.scores.locating
-    return bool(left) and set(evidence.accepted) <= locating and not any(s.is_of_values for s in left)
+    moves = not locating.isdisjoint(evidence.accepted)
+    return bool(left) and moves and not any(s.is_of_values for s in left)
 
 
 def _hides(evidence: Evidence, level: float) -> bool:

@@ -8,3 +8,6 @@ cannot tell. Which rule leads to which: `dtprob.gap.decide.decide`."""
 
 UNSEEN: Final = "nothing observed depends on it"
 """What stands for the parameter that absorbs a candidate where there is none."""
+
+READ_TWICE: Final = "was a log read twice?"
+"""What the note on readings that are copies of others asks."""

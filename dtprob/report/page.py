@@ -7,7 +7,7 @@ from typing import Any
 import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from dtprob.gap.vocabulary import UNSEEN
+from dtprob.gap.vocabulary import READ_TWICE, UNSEEN
 from dtprob.report import names, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
@@ -127,7 +127,8 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= {function.__name__: function for function in _FILTERS}
-    made.globals |= dict[str, Any]({function.__name__: function for function in _FUNCTIONS}, UNSEEN=UNSEEN)
+    words = {"UNSEEN": UNSEEN, "READ_TWICE": READ_TWICE}
+    made.globals |= dict[str, Any]({function.__name__: function for function in _FUNCTIONS}, **words)
     return made
 
 

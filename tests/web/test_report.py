@@ -189,6 +189,16 @@ def test_warnings_are_said_with_the_verdict(examples: dict[str, Any]) -> None:
     assert "Treat this verdict with care" not in Page(render(examples["LISTED"](), None, title="x")).text
 
 
+def test_copies_are_said_with_the_verdict(examples: dict[str, Any]) -> None:
+    """They make gaps of their own."""
+    report = examples["UNLISTED"]()
+    report["fit"]["warnings"] = [
+        "9 of 90 values of y are others again: was a log read twice? Leave copies out"
+    ]
+    text = Page(render(report, None, title="x")).text
+    assert "9 of 90 values of y are others again" in text[: text.index("Where it lies")]
+
+
 def test_same_input_gives_the_same_page(report: dict[str, Any], gap: xr.DataTree, page: str) -> None:
     settings = dict(mpl.rcParams)
     assert render(report, gap, title="Street canyon") == page

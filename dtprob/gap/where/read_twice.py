@@ -8,6 +8,7 @@ import numpy as np
 
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import is_continuous
+from dtprob.gap.vocabulary import READ_TWICE
 from dtprob.gap.where.data_columns import all_columns
 from dtprob.models.declaration import Site
 
@@ -34,7 +35,7 @@ def read_twice(problem: Problem) -> list[str]:
             continue
         if again := _copies(problem, name, site):
             what = f"{again} of {count} values of {site.argument or name} are others again, the same in every column"
-            found.append(f"{what}: was a log read twice? They count as independent; leave copies out")
+            found.append(f"{what}: {READ_TWICE} They count as independent; leave copies out")
     return found
 
 

@@ -343,9 +343,10 @@ def test_elements_at_one_place_couple_too(build_world):
 
 def test_calibration_and_cable_of_one_element(world, apply):
     before = apply()
-    found = apply("array_calibration[rx_2]", log_gain=0.3, phase=-0.4)["rx_response"]
-    assert np.allclose(found[..., 2], before["rx_response"][..., 2] * np.exp(0.3 - 0.4j))
+    found = apply("array_calibration[rx_2]", fraction=0.3, phase=-0.4)["rx_response"]
+    assert np.allclose(found[..., 2], before["rx_response"][..., 2] * 0.7 * np.exp(-0.4j))
     assert np.array_equal(found[..., [0, 1, 3]], before["rx_response"][..., [0, 1, 3]])
+    assert not apply("array_calibration[rx_2]", fraction=1.0, phase=0.0)["rx_response"][..., 2].any()
     ratio = apply("cable_delay[tx_1]", delay=2e-9)["noiseless_channel"] / before["noiseless_channel"]
     turn = np.exp(-2j * np.pi * np.asarray(world.data["subcarrier_frequency"]) * 2e-9)
     assert np.allclose(ratio[:, :, :, 1], turn)

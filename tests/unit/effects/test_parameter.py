@@ -73,3 +73,9 @@ def test_labels_are_one_for_each_entry():
     assert Parameter("gain", prior, labels=("left", "right")).labels == ("left", "right")
     with pytest.raises(InputError, match="labels of parameter gain: expected 2, one for each entry, got 3"):
         Parameter("gain", prior, labels=("x", "y", "z"))
+
+
+def test_a_unit_is_text():
+    """No diagnosis ends in a report that cannot hold its unit."""
+    with pytest.raises(InputError, match="unit of parameter gain: expected text, got None"):
+        Parameter("gain", dist.Normal(0.0, 1.0), unit=None)  # pyright: ignore[reportArgumentType]

@@ -71,6 +71,13 @@ def test_what_moves_expectations_imitates_no_spread(left, locates, closed, verdi
     assert decide(found, (cause(closed),), Settings()) == verdict
 
 
+def test_a_noise_beside_what_moves_expectations_does_not_take_its_name_away():
+    """A saturation that also squeezes the noise: the saturation is named beside a noise that stands for the squeezing."""
+    found = evidence("mean", 1e-6, left="spread")
+    found.accepted = ("a", "noise")
+    assert decide(found, (cause(0.73),), Settings()) == "LISTED_WITH_REMAINDER"
+
+
 @pytest.mark.parametrize(
     ("closed", "p_after", "verdict"),
     [(0.8, 1e-6, "UNLISTED"), (0.8, 0.5, "UNDETERMINED"), (0.99, 1e-6, "UNDETERMINED")],
