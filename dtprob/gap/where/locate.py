@@ -33,7 +33,7 @@ from dtprob.gap.where.foremost import foremost
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.in_all import InAll
 from dtprob.gap.where.moments import further_moments
-from dtprob.gap.where.quantities import Quantity, cells, groups, quantity, together
+from dtprob.gap.where.quantities import Quantity, cells, groups, of_each, quantity, together
 from dtprob.gap.where.repeats import repeats
 from dtprob.gap.where.site_finding import SURE, SiteFinding, rank, shadows_last
 from dtprob.gap.where.suspects import Suspect, plainest, suspects
@@ -174,6 +174,8 @@ def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
         for axes, shape, given in _observed(problem)
         for q, found in together(axes, shape, given)
     ]
+    each = _columns(problem)
+    over += [(q, (found,)) for n, (axes, value) in each.items() for q, found in of_each(n, axes, value)]
     discrete = any(is_discrete(family) for family in problem.families.values())
     normal = normal_like(drawn) if discrete else None
     return _Ways(values, along, over, unnamed(problem, x), normal, tuple(repeats(problem, x)))
@@ -212,11 +214,7 @@ def _test_sites(
 
 def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
     """What the model computes and the data tell along several axes: a perturbation may vary over it."""
-    columns = {
-        name: (site.axes, column)
-        for site in problem.declaration.observed.values()
-        for name, column in whole_columns(problem, site).items()
-    }
+    columns = _columns(problem)
     computed = {name: (problem.declaration.sites[name].axes, value) for name, value in values.items()}
     for name, (axes, value) in (columns | computed).items():
         if (found := quantity(name, axes, value)) is not None:
@@ -225,6 +223,15 @@ def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[
         yield from groups(name, axes, value)
     for axes, shape, given in _observed(problem):
         yield from cells(axes, shape, given)
+
+
+def _columns(problem: Problem) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
+    """Axes and values of the columns of the data along several axes."""
+    return {
+        name: (site.axes, column)
+        for site in problem.declaration.observed.values()
+        for name, column in whole_columns(problem, site).items()
+    }
 
 
 def _observed(problem: Problem) -> Iterator[tuple[tuple[str, ...], tuple[int, ...], dict[str, np.ndarray]]]:

@@ -8,18 +8,22 @@ from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
+from scipy import sparse
 
-from dtprob.gap.where.crossed import MOST_PAIRS, along_in_groups, joined, over_both
+from dtprob.gap.where.crossed import MOST_PAIRS, along_in_groups, in_groups, joined, over_both
 from dtprob.gap.where.curves import (
     GROUPS,
     ORDER,
     SMOOTH_FROM,
     Curves,
+    between,
     by_group,
+    cycles,
     grouped,
     groups_in_words,
     over_column,
 )
+from dtprob.gap.where.ordered import COLUMNS
 from dtprob.models.axes import is_unnamed
 
 _LARGEST: Final = 1 << 18
@@ -105,6 +109,41 @@ def groups(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[Quant
         _, rows = np.unique(values.reshape(-1, last), axis=0, return_inverse=True)
         whole = rows.reshape(values.shape[:-1])
         yield Quantity(f"{name} of all", tuple(axes[:-1]), whole, ordered=False, coded=True)
+
+
+def of_each(name: str, axes: Sequence[str], values: np.ndarray) -> Iterator[tuple[Quantity, Curves]]:
+    """What stretches of an axis and cycles do where a yes stands at an entry of the last axis: while device 1 sends.
+
+    As of a device that listens for a part of the time only: of others nothing is wrong then.
+
+    Args:
+        name: of a column of two values, of which the less common one is the yes.
+        axes: cluster, one along which its rows follow one another, and a short one.
+        values: of the column.
+    """
+    distinct, index, count = np.unique(values, return_inverse=True, return_counts=True)
+    if values.ndim != 3 or len(distinct) != 2 or values.shape[-1] > COLUMNS:
+        return
+    yes = int(count.argmin())
+    members = (index.reshape(-1, values.shape[-1]) == yes).T.astype(float)
+    often = np.flatnonzero(members.sum(axis=1) >= _OFTEN)
+    if not often.size:
+        return
+    rows = sparse.csr_matrix(members[often])
+    places = tuple(f"{axes[-1]} {i} with {name} {float(distinct[yes]):.4g}" for i in often)
+    group = Curves(f"by {name} of each {axes[-1]}", rows, places=places)
+    lead = values.shape[:-1]
+    whole = Quantity(
+        f"{name} of each {axes[-1]}", tuple(axes[:-1]), np.zeros(lead), ordered=False, coded=True
+    )
+    turn = np.tile(np.arange(lead[1]), lead[0])
+    yield from (
+        (whole, found) for found in in_groups(group, *between(f"stretch of {axes[1]}", axes[1], turn))
+    )
+    for found in cycles(len(turn), f"{axes[0]} and {axes[1]}"):
+        for row, place in zip(rows, places, strict=True):
+            turns = sparse.csr_matrix(sparse.csr_matrix(found.values).multiply(row))
+            yield whole, replace(found, label=f"{found.label} of {place}", values=turns)
 
 
 def cells(

@@ -10,7 +10,7 @@ from dtprob.gap.where.along import curves
 from dtprob.gap.where.data_columns import all_columns, whole_columns
 from dtprob.gap.where.families import Family, Pattern, Summed
 from dtprob.gap.where.family_test import family_test
-from dtprob.gap.where.quantities import cells, groups, quantity, together
+from dtprob.gap.where.quantities import cells, groups, of_each, quantity, together
 
 
 @pytest.fixture
@@ -245,3 +245,30 @@ def test_columns_on_different_axes_are_looked_over_together_and_those_of_one_are
     product = np.cos(np.pi * (np.argsort(np.argsort(battery[:, 0])) + 0.5) / 12)[:, None]
     product = product * np.cos(np.pi * (np.argsort(np.argsort(heat[0])) + 0.5) / 30)
     assert np.abs(np.corrcoef(product.reshape(-1), found["over battery and heat"].values[0])[0, 1]) > 0.999
+
+
+def test_a_device_may_be_off_in_turns_while_it_sends():
+    """What happens to a device's own packets in the first slots of every ten: others are none the wiser."""
+    rng = np.random.default_rng(0)
+    sending = rng.random((40, 30, 3)) < 0.3
+    found = {
+        curve.label: (over, curve)
+        for over, curve in of_each("sending", ("episode", "slot", "device"), sending)
+    }
+    over, curve = found["every 10 along episode and slot of device 1 with sending 1"]
+    assert over.axes == ("episode", "slot")
+    assert over.kept(("episode", "slot", "outcome"), (40, 30, 4)) == (0, 1)
+    turn = np.arange(1200) % 10
+    expected = np.stack([(turn == phase) & sending[..., 1].reshape(-1) for phase in range(10)])
+    assert np.array_equal(curve.values.toarray(), expected)
+    _, stretch = found["stretch of slot by sending of each device"]
+    at = stretch.places.index("device 1 with sending 1, slot 0 to 7")
+    own = sending[..., 1] & (np.arange(30) < 8)
+    assert np.array_equal(stretch.values[[at]].toarray().reshape(40, 30), own)
+
+
+@pytest.mark.parametrize(
+    "values", [np.zeros((9, 8, 3)), np.arange(216.0).reshape(9, 8, 3) % 3, np.eye(20)[:, :, None] > 0]
+)
+def test_only_what_is_often_a_yes_has_turns(values):
+    assert not list(of_each("x", ("episode", "slot", "device"), values))
