@@ -205,7 +205,7 @@ def test_a_wave_on_a_tap_stays_there_and_noise_spreads_evenly():
 def test_uneven_subcarriers_and_foreign_powers_are_refused(paths):
     channel = np.ones((1, 1, 1, 1, 3), complex)
     with pytest.raises(InputError, match="common grid"):
-        delay_profile(measured(channel, np.array([0.0, 1.0, 2.5])))
+        delay_profile(measured(channel, np.array([0.0, 1e6, 2.5e6])))
     with pytest.raises(InputError, match="common grid"):
         delay_profile(measured(channel[..., :1], np.array([0.0])))
     with pytest.raises(InputError, match=r"\(5, 49\)"):
