@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dtprob.gap.diagnosis import Cause, Diagnosis
+from dtprob.gap.diagnosis import Cause, Diagnosis, meant
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.at_end import shared_draws
 from dtprob.gap.how_far.terms import in_user_terms
@@ -51,7 +51,13 @@ def compose(
         "unlisted": {**unlisted(evidence.after, settings.level / 2), "called_for": list(evidence.asked_for)},
         "remainder": _remainder(evidence),
         "detectable": [
-            {"effect": name, "size": one.size, "parameter": one.parameter.name, "unit": one.parameter.unit}
+            {
+                "effect": name,
+                "size": one.size,
+                "parameter": one.parameter.name,
+                "unit": one.parameter.unit,
+                **meant(one.parameter.meaning),
+            }
             for name, one in zip(first.names, first.detectable, strict=True)
             if one is not None
         ],

@@ -41,10 +41,18 @@ class Interval(TypedDict):
     high: Number
 
 
+class Meaning(TypedDict):
+    """How a size x is told: as x, 100 x percent, the factor exp(x), or 1 - exp(-x), a share, in percent."""
+
+    words: str
+    told_as: Literal["number", "percent", "factor", "share"]
+
+
 class Size(Interval):
     """The size of one parameter of an effect, in SI units; without `unit` the key ends in one: `delay_s`."""
 
     unit: NotRequired[str]
+    meaning: NotRequired[Meaning]
 
 
 class Strata(TypedDict):
@@ -186,6 +194,7 @@ class Detectable(TypedDict):
     size: Number
     unit: NotRequired[str]
     parameter: NotRequired[str]
+    meaning: NotRequired[Meaning]
 
 
 class Candidate(TypedDict):

@@ -8,7 +8,7 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from dtprob.gap.vocabulary import READ_TWICE, UNSEEN
-from dtprob.report import names, units
+from dtprob.report import names, sizes, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Candidate, Interval, Report, Tried, is_quiet, validate
@@ -155,8 +155,8 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     bar,
 )
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
-    names.size_reading,
+    sizes.size_reading,
     names.user_terms,
-    names.apart,
+    sizes.apart,
     units.reading,
 )

@@ -16,7 +16,6 @@ from dtprob.report.names import (
     located_words,
     shares,
     significant,
-    size_reading,
     spoken,
     term,
     together,
@@ -25,6 +24,7 @@ from dtprob.report.names import (
     words,
 )
 from dtprob.report.next_step import changed, decides, left_over, next_step, rivals
+from dtprob.report.sizes import size_reading
 from dtprob.report.units import DASH, percent
 
 _NAMING = ("LISTED", "LISTED_WITH_REMAINDER")

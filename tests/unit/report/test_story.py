@@ -4,7 +4,7 @@ import pytest
 
 from dtprob.effects import summaries
 from dtprob.gap.vocabulary import UNSEEN
-from dtprob.report import names
+from dtprob.report import names, sizes
 from dtprob.report.advice import ADVICE, family
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Cause, Detectable
@@ -72,7 +72,7 @@ def test_user_terms_share_unit_and_decimals() -> None:
 
 
 def test_estimates_of_strata_share_the_unit_of_the_size() -> None:
-    shown = names.apart("delay_s", {"mean": 1e-9, "low": 0.9e-9, "high": 1.1e-9}, [0.98e-9, 1.03e-9])
+    shown = sizes.apart("delay_s", {"mean": 1e-9, "low": 0.9e-9, "high": 1.1e-9}, [0.98e-9, 1.03e-9])
     assert shown == "0.98 and 1.03\u202fns"
 
 
@@ -98,25 +98,25 @@ def test_detectable_sizes_of_a_family_are_its_worst() -> None:
 
 def test_sizes_drop_the_unit_of_their_key() -> None:
     interval = {"mean": 0.1, "low": 0.05, "high": 0.15}
-    label, shown = names.size_reading("array_calibration[rx_1].log_gain_Np", {**interval, "unit": "Np"})
+    label, shown = sizes.size_reading("array_calibration[rx_1].log_gain_Np", {**interval, "unit": "Np"})
     assert label == "array calibration (rx 1): gain"
     assert (shown.mean, shown.unit) == ("0.87", "dB")
-    assert names.size_reading("velocity_x_m_per_s", {**interval, "unit": "m/s"})[0] == "velocity x"
-    assert names.size_reading("scale_rad_per_s0.5", {**interval, "unit": "rad/s^0.5"})[0] == "scale"
-    assert names.size_reading("delay_s", interval)[0] == "delay"
-    assert names.size_reading("gps.metres_1", {**interval, "unit": "1"})[0] == "gps: metres 1"
+    assert sizes.size_reading("velocity_x_m_per_s", {**interval, "unit": "m/s"})[0] == "velocity x"
+    assert sizes.size_reading("scale_rad_per_s0.5", {**interval, "unit": "rad/s^0.5"})[0] == "scale"
+    assert sizes.size_reading("delay_s", interval)[0] == "delay"
+    assert sizes.size_reading("gps.metres_1", {**interval, "unit": "1"})[0] == "gps: metres 1"
 
 
 def test_a_logarithm_is_told_as_a_factor() -> None:
     size: names.Size = {"mean": 0.7, "low": 0.6, "high": 0.8, "unit": "1"}
-    label, shown = names.size_reading("label_noise[x0_low].log_ratio", size)
+    label, shown = sizes.size_reading("label_noise[x0_low].log_ratio", size)
     assert (label, shown.mean, shown.low, shown.high) == (
         "label noise (x0 low): ratio",
         "2.01",
         "1.82",
         "2.23",
     )
-    assert names.apart("log_ratio", size, [0.6, 0.8]) == "1.82 and 2.23"
+    assert sizes.apart("log_ratio", size, [0.6, 0.8]) == "1.82 and 2.23"
 
 
 def test_code_names_in_sentences_become_words() -> None:
