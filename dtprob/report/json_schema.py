@@ -98,7 +98,8 @@ class Site(TypedDict):
     """A site of the model, with its share of the gap; `family` says how it must change to close it.
 
     `moment` is what of an observation is wrong where its values are right, `whereabouts` where or along what.
-    Where one group, position or reading brings most of what is wrong, `place` names it.
+    Where one group, position or reading brings most of what is wrong, `place` names it. What `spreads` moves nothing but
+    how observations spread.
     """
 
     site: str
@@ -108,6 +109,7 @@ class Site(TypedDict):
     moment: NotRequired[str]
     whereabouts: NotRequired[str]
     place: NotRequired[str]
+    spreads: NotRequired[bool]
 
 
 class Coordinates(TypedDict):
@@ -201,7 +203,8 @@ class Candidate(TypedDict):
     """One line of the screening; an effect that a fitted parameter absorbs, or that nothing shows, has no statistic.
 
     Of an `opposite` one the data ask for the side of its size that its prior excludes; of one with `beyond` for so many
-    times the size that its prior calls usual, its root mean square from the null.
+    times the size that its prior calls usual, its root mean square from the null. What `spreads` moves nothing but how
+    observations spread, as noise does.
     """
 
     effect: str
@@ -213,6 +216,7 @@ class Candidate(TypedDict):
     opposite: NotRequired[bool]
     beyond: NotRequired[Number]
     kind: NotRequired[str]
+    spreads: NotRequired[bool]
 
 
 class Nuisance(Interval):
