@@ -5,7 +5,7 @@
 """
 
 from dtprob.effects.distributions import ComplexStudentT, replace_base
-from dtprob.effects.effect import Context, Effect, Parameter
+from dtprob.effects.effect import Context, Effect, Meaning, Parameter
 from dtprob.effects.library import FAMILIES, catalogue, summaries
 from dtprob.effects.rewriting import Rewriting, with_effects
 
@@ -14,6 +14,7 @@ __all__ = [
     "ComplexStudentT",
     "Context",
     "Effect",
+    "Meaning",
     "Parameter",
     "Rewriting",
     "catalogue",

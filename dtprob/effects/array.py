@@ -30,6 +30,7 @@ from dtprob.effects.common import (
     on_axis,
     phasor,
     positions,
+    told,
 )
 from dtprob.effects.effect import FIELD, Effect
 from dtprob.effects.elements import DIRECTION, arrays, ends, phase_rewrite
@@ -86,7 +87,10 @@ def array_calibration(sites: Sites, _data: Data) -> list[Effect]:
                 Effect(
                     "array_calibration",
                     {f"{side}_response": weigh},
-                    (normal("fraction", 0.7), normal("phase", 0.5, "rad")),
+                    (
+                        told(normal("fraction", 0.7), "amplitude that it lacks", "percent"),
+                        normal("phase", 0.5, "rad"),
+                    ),
                     instance=name,
                     physics=f"Element {index} of the {side} array lacks this share of its amplitude (1: it is dead).",
                     source="(1 - s) exp(j phi) on one element's response.",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import jax
@@ -13,7 +13,7 @@ import numpyro.distributions as dist
 from jax import lax
 from jaxtyping import Array, Bool, Complex, Float, Int
 
-from dtprob.effects.effect import Effect, Parameter, Rewrite
+from dtprob.effects.effect import Effect, Meaning, Parameter, Rewrite, ToldAs
 from dtprob.effects.meaning import SiteLike, means
 from dtprob.raytracing.paths import NONE, PathSet
 
@@ -41,6 +41,11 @@ def normal(
 def half_normal(name: str, scale: float, unit: str = "1") -> Parameter:
     """A parameter that is zero or more, |N(0, scale^2)|; its density at the null itself counts too."""
     return Parameter(name, dist.HalfNormal(scale, validate_args=False), 0.0, unit)
+
+
+def told(parameter: Parameter, words: str, told_as: ToldAs = "number") -> Parameter:
+    """The parameter with what its size means to people; see `Meaning`."""
+    return replace(parameter, meaning=Meaning(words, told_as))
 
 
 def place(name: str, tried: Float[np.ndarray, " n"], unit: str, *, centre: float, spread: float) -> Parameter:

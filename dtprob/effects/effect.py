@@ -23,12 +23,26 @@ type Rewrite = Callable[[Any, Mapping[str, Any], "Context"], Any]
 type FieldShape = Callable[[Any, "Context"], tuple[int, ...]]
 type Model = Callable[..., Any]
 type EffectKind = Literal["mean", "variance"]
+type ToldAs = Literal["number", "percent", "factor", "share"]
 
 FIELD = "field"
 _PRIOR_DRAWS: Final = 4001
 """Draws that tell how far a prior without a variance reaches."""
 _QUARTILE: Final = float(stats.norm.ppf(0.75))
 """Median distance of a standard normal from its middle."""
+
+
+@dataclass(frozen=True)
+class Meaning:
+    """How the size of a parameter x is told to people, where that is another number than x itself.
+
+    Attributes:
+        words: what the told number is, e.g. "slots in which its radio is off".
+        told_as: "number" x, "percent" 100 x, "factor" exp(x), "share" 1 - exp(-x) in percent.
+    """
+
+    words: str
+    told_as: ToldAs = "number"
 
 
 @dataclass(frozen=True)
@@ -45,6 +59,7 @@ class Parameter:
         tried: values of a place at which an effect of one size is looked for before it is fitted; its prior, a normal one,
             is then centred at the best of them.
         labels: what its entries are called in a report, one after another; their indices where none are given.
+        meaning: how its size is told to people; by its name and unit where none is given.
     """
 
     name: str
@@ -54,6 +69,7 @@ class Parameter:
     is_place: bool = False
     tried: tuple[float, ...] = ()
     labels: tuple[str, ...] = ()
+    meaning: Meaning | None = None
 
     def __post_init__(self) -> None:
         """Check its unit and labels, that what is tried is one place, and that no size can only be below its null."""

@@ -9,7 +9,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from dtprob.gap.diagnosis import Cause, Diagnosis
+from dtprob.effects.effect import Effect
+from dtprob.gap.diagnosis import Cause, Diagnosis, meant
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.fitting.at_end import shared_draws
 from dtprob.gap.how_far.terms import in_user_terms
@@ -19,6 +20,7 @@ from dtprob.gap.maps import maps
 from dtprob.gap.settings import Settings
 from dtprob.gap.vocabulary import Verdict
 from dtprob.gap.where.closed_share import closed_shares
+from dtprob.gap.where.coordinates import CoordinateFinding
 from dtprob.gap.where.site_finding import SiteFinding
 from dtprob.gap.which.screen import Screening
 from dtprob.gap.which.trials import credit
@@ -51,7 +53,13 @@ def compose(
         "unlisted": {**unlisted(evidence.after, settings.level / 2), "called_for": list(evidence.asked_for)},
         "remainder": _remainder(evidence),
         "detectable": [
-            {"effect": name, "size": one.size, "parameter": one.parameter.name, "unit": one.parameter.unit}
+            {
+                "effect": name,
+                "size": one.size,
+                "parameter": one.parameter.name,
+                "unit": one.parameter.unit,
+                **meant(one.parameter.meaning),
+            }
             for name, one in zip(first.names, first.detectable, strict=True)
             if one is not None
         ],
@@ -100,7 +108,7 @@ def summary(
             return f"{much} of the gap comes from {name}{closed_part}; {_rest(evidence)} left."
         case "UNLISTED":
             sites = [s for s in evidence.after.sites[:2] if s.p_value <= 0.01]
-            at = f"; most of it at {sites[0].place}" if sites and sites[0].place is not None else ""
+            at = _most_at(sites[0], evidence.before.coordinates) if sites else ""
             tail = f" It shows at {', '.join(map(_place, sites))}{at}." if sites else ""
             verb = "imitate" if best is not None and len(best.effects) > 1 else "imitates"
             part = (
@@ -139,6 +147,17 @@ def _undecided(sets: Sequence[Sequence[str]]) -> str:
     if "" in rests:
         return f"The gap comes from {sure}, perhaps together with {choice}: the data cannot tell."
     return f"The gap comes from {sure} together with {choice}, and the data cannot tell which."
+
+
+def _most_at(first: SiteFinding, blocks: Sequence[CoordinateFinding]) -> str:
+    """Where most of it is, in the words of the first site, or the block of the data that stands out most."""
+    if first.place is not None:
+        return f"; most of it at {first.place}"
+    worst = max(blocks, key=lambda block: block.excess, default=None)
+    if first.whereabouts is not None or worst is None:
+        return ""
+    ends = f"{worst.low}" if worst.low == worst.high else f"{worst.low} to {worst.high}"
+    return f", and in the data most at {worst.axis} {ends}"
 
 
 def _place(found: SiteFinding) -> str:
@@ -211,9 +230,18 @@ def _screening(evidence: Evidence) -> list[dict[str, Any]]:
             "absorbed_by": None if first.names[i] in refitted else first.absorbed_by[i],
             "opposite": first.opposite[i],
             "beyond": first.beyond[i],
+            "spreads": spreads_only(effects[first.names[i]], evidence, locates=first.locates[i]),
         }
         for i in map(int, order)
     ]
+
+
+def spreads_only(effect: Effect, evidence: Evidence, *, locates: bool) -> bool:
+    """Whether an effect moves nothing but how observations spread; a random field does where its sites do."""
+    if effect.kind == "mean":
+        return not locates
+    spreading = {found.site for found in evidence.before.sites if found.spreads}
+    return set(effect.sites) <= {*spreading, *evidence.problem.declaration.observed}
 
 
 def _alike(first: Screening) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from dtprob.effects.effect import Meaning
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.how_far.shares import Share
 from dtprob.gap.vocabulary import Verdict
@@ -17,13 +18,14 @@ from dtprob.inference.storage import renamed, without_slashes
 
 @dataclass(frozen=True)
 class Size:
-    """Posterior of one scalar of an effect's parameter: mean and 90% interval in `unit`."""
+    """Posterior of one scalar of an effect's parameter: mean and 90% interval in `unit`, and how that is told to people."""
 
     name: str
     mean: float
     low: float
     high: float
     unit: str
+    meaning: Meaning | None = None
 
 
 @dataclass(frozen=True)
@@ -99,7 +101,7 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "effects": list(cause.effects),
         "alias_class": [list(names) for names in cause.alias_class],
         "probability": cause.probability,
-        "size": {s.name: {"mean": s.mean, "low": s.low, "high": s.high, "unit": s.unit} for s in cause.size},
+        "size": {size.name: _size(size) for size in cause.size},
         "closed_fraction": None
         if closed is None
         else {"mean": closed.mean, "low": closed.low, "high": closed.high},
@@ -109,6 +111,15 @@ def _cause(cause: Cause) -> dict[str, Any]:
         "strata": {"estimate": list(cause.strata)},
         "plausible": cause.plausible,
     }
+
+
+def _size(size: Size) -> dict[str, Any]:
+    return {"mean": size.mean, "low": size.low, "high": size.high, "unit": size.unit, **meant(size.meaning)}
+
+
+def meant(meaning: Meaning | None) -> dict[str, Any]:
+    """How a size is told, as an entry of report.json beside it; none where it has no meaning of its own."""
+    return {} if meaning is None else {"meaning": asdict(meaning)}
 
 
 def plain(value: Any) -> Any:

@@ -100,5 +100,7 @@ def _rank(one: tuple[SiteFinding, float | None]) -> tuple[bool, bool, bool, floa
 
 def _located(found: SiteFinding, share: float | None) -> dict[str, Any]:
     told = {"moment": found.moment, "whereabouts": found.whereabouts, "place": found.place}
-    there = {name: words for name, words in told.items() if words is not None}
+    there: dict[str, Any] = {name: words for name, words in told.items() if words is not None}
+    if found.spreads:
+        there["spreads"] = True
     return {"site": found.site, "p_value": found.p_value, "share": share, "family": found.family, **there}

@@ -1,6 +1,11 @@
 """What to change in a twin, for each family of effects: one sentence that a user can act on."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Final
+
+from dtprob.report.json_schema import Size
+from dtprob.report.names import words
 
 ADVICE: Mapping[str, str] = {
     # channel
@@ -76,13 +81,51 @@ ADVICE: Mapping[str, str] = {
     "interferer": "add an interferer that blocks reception in some slots",
     "ack_loss": "let acknowledgements be lost with the estimated probability",
     "drift": "let the parameter change over time instead of staying fixed",
-    "duty_cycle": "limit the device to its duty cycle",
+    "duty_cycle": (
+        "check whether the device's radio is off for a part of the time (a sleep schedule, a battery); if it is, let it"
+        " be silent in that part of its slots in the twin"
+    ),
     # labels
     "regional_bias": "correct the predictions in the region concerned",
     "scale_bias": "scale and shift the predictions by the estimates",
     "label_noise": "raise the noise of the labels to the estimate",
     "stale_map": "replace the map behind the predictions by a current one",
 }
+
+
+CALIBRATE_ELEMENT: Final = (
+    "calibrate the element, or apply the estimated amplitude and phase to it in the twin"
+)
+DEAD_ELEMENT: Final = (
+    "look whether the element is dead or its cable is off; if it stays so, leave it out of twin and data"
+)
+_DEAD: Final = 0.9
+"""Share of its amplitude from which on an element that lacks it is dead."""
+
+
+def advice(effect: str, size: Mapping[str, Size] = MappingProxyType({})) -> str:
+    """What to do about an effect, as an imperative without capital and full stop.
+
+    Args:
+        effect: its name.
+        size: of its cause, by the keys of report.json.
+    """
+    if family(effect) == "array_calibration" and (lacks := _lacks(effect, size)) is not None:
+        return DEAD_ELEMENT if lacks >= _DEAD else CALIBRATE_ELEMENT
+    return ADVICE.get(family(effect), f"add {words(effect)}, with its estimated size, to the twin")
+
+
+def worth_telling(effects: Sequence[str], size: Mapping[str, Size]) -> dict[str, Size]:
+    """The sizes without those that mean nothing: the phase of an element that is dead."""
+    dead = [e for e in effects if advice(e, size) == DEAD_ELEMENT]
+    idle = {key for e in dead for key in ("phase_rad", f"{e}.phase_rad")}
+    return {name: one for name, one in size.items() if name not in idle}
+
+
+def _lacks(effect: str, size: Mapping[str, Size]) -> float | None:
+    """The share of its amplitude that one element lacks; None of a whole array."""
+    found = size.get("fraction") or size.get(f"{effect}.fraction")
+    return None if found is None else found["mean"]
 
 
 def family(effect: str) -> str:

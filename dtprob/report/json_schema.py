@@ -41,10 +41,18 @@ class Interval(TypedDict):
     high: Number
 
 
+class Meaning(TypedDict):
+    """How a size x is told: as x, 100 x percent, the factor exp(x), or 1 - exp(-x), a share, in percent."""
+
+    words: str
+    told_as: Literal["number", "percent", "factor", "share"]
+
+
 class Size(Interval):
     """The size of one parameter of an effect, in SI units; without `unit` the key ends in one: `delay_s`."""
 
     unit: NotRequired[str]
+    meaning: NotRequired[Meaning]
 
 
 class Strata(TypedDict):
@@ -90,7 +98,8 @@ class Site(TypedDict):
     """A site of the model, with its share of the gap; `family` says how it must change to close it.
 
     `moment` is what of an observation is wrong where its values are right, `whereabouts` where or along what.
-    Where one group, position or reading brings most of what is wrong, `place` names it.
+    Where one group, position or reading brings most of what is wrong, `place` names it. What `spreads` moves nothing but
+    how observations spread.
     """
 
     site: str
@@ -100,6 +109,7 @@ class Site(TypedDict):
     moment: NotRequired[str]
     whereabouts: NotRequired[str]
     place: NotRequired[str]
+    spreads: NotRequired[bool]
 
 
 class Coordinates(TypedDict):
@@ -186,13 +196,15 @@ class Detectable(TypedDict):
     size: Number
     unit: NotRequired[str]
     parameter: NotRequired[str]
+    meaning: NotRequired[Meaning]
 
 
 class Candidate(TypedDict):
     """One line of the screening; an effect that a fitted parameter absorbs, or that nothing shows, has no statistic.
 
     Of an `opposite` one the data ask for the side of its size that its prior excludes; of one with `beyond` for so many
-    times the size that its prior calls usual, its root mean square from the null.
+    times the size that its prior calls usual, its root mean square from the null. What `spreads` moves nothing but how
+    observations spread, as noise does.
     """
 
     effect: str
@@ -204,6 +216,7 @@ class Candidate(TypedDict):
     opposite: NotRequired[bool]
     beyond: NotRequired[Number]
     kind: NotRequired[str]
+    spreads: NotRequired[bool]
 
 
 class Nuisance(Interval):

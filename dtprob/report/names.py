@@ -5,14 +5,12 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Final
 
-from dtprob.report.json_schema import Cause, Coordinates, Interval, Remainder, Site, Size
+from dtprob.report.json_schema import Cause, Coordinates, Interval, Remainder, Site
 from dtprob.report.units import (
-    Reading,
     Scale,
     decimals_between,
     number,
     percent,
-    reading,
     scale_for,
     split_unit,
     with_unit,
@@ -65,9 +63,6 @@ _WAYS: Final = {
 """How a way of varying is told, by its first word."""
 
 LEVEL = 0.05
-LOG: Final = "log_"
-_LARGEST: Final = 700.0
-"""Largest exponent whose exponential is a number."""
 _PARTS: Final = 4
 """Blocks told together that are named."""
 _DIGITS: Final = 4
@@ -167,29 +162,6 @@ def capital(text: str) -> str:
     return text[:1].upper() + text[1:]
 
 
-def size_reading(name: str, size: Size) -> tuple[str, Reading]:
-    """The words for a parameter and its size in human units."""
-    owner, _, parameter = _stem(name, size).rpartition(".")
-    if size.get("unit", "").startswith("Np"):  # shown in dB, which says that it is a logarithm
-        parameter = parameter.removeprefix(LOG)
-    unit, mean, low, high = _unit(name, size), size["mean"], size["low"], size["high"]
-    if is_factor(parameter, unit):
-        parameter = parameter.removeprefix(LOG)
-        mean, low, high = exponential(mean), exponential(low), exponential(high)
-    label = words(parameter) if not owner else f"{words(owner)}: {words(parameter)}"
-    return label, reading(mean, low, high, unit)
-
-
-def apart(name: str, size: Size, estimates: Sequence[float | None]) -> str:
-    """Estimates of one parameter from several parts of the data, in the unit of its size."""
-    unit, ends, values = _unit(name, size), (size["low"], size["high"]), list(estimates)
-    if is_factor(_stem(name, size).rpartition(".")[2], unit):
-        ends, values = (exponential(ends[0]), exponential(ends[1])), list(map(exponential, values))
-    scale = scale_for([*ends, *values], unit)
-    decimals = decimals_between(scale(ends[0]), scale(ends[1]))
-    return with_unit(listing(number(scale(value), decimals) for value in values), scale.unit)
-
-
 def shares(interval: Interval) -> str:
     """An interval of shares: `88 to 97%`, or `−84 to 12%` of what may do harm."""
     return f"{percent(interval['low']).rstrip('%')} to {percent(interval['high'])}"
@@ -265,30 +237,6 @@ def _span(low: float, high: float) -> str:
     return first if low == high else f"{first}\u00a0to\u00a0{last}"
 
 
-def is_factor(parameter: str, unit: str) -> bool:
-    """Whether a number is the logarithm of a factor, which people read more easily."""
-    return parameter.startswith(LOG) and unit == "1"
-
-
-def exponential(value: float | None) -> float | None:
-    """A factor from its logarithm; None stays None."""
-    return None if value is None else math.exp(min(value, _LARGEST))
-
-
 def aliases(cause: Cause) -> list[list[str]]:
     """The sets of effects that the data cannot tell from the cause, without the cause itself."""
     return [other for other in cause["alias_class"] if sorted(other) != sorted(cause["effects"])]
-
-
-def _stem(name: str, size: Size) -> str:
-    """The key of a size without the unit at its end: `delay_s`, `velocity_m_per_s`."""
-    if "unit" not in size:
-        return split_unit(name)[0]
-    if size["unit"] == "1":  # a number at the end is an entry's
-        return name
-    unit = size["unit"].replace("/", "_per_").replace("^", "").replace(" ", "_")
-    return name[: -len(unit) - 1] if name.lower().endswith(f"_{unit.lower()}") else name
-
-
-def _unit(name: str, size: Size) -> str:
-    return size.get("unit", split_unit(name)[1])

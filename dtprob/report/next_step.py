@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from dtprob.gap.vocabulary import READ_TWICE
 from dtprob.report.json_schema import Report, Site
 from dtprob.report.names import block, detail, listing, located_words, significant, words
 
@@ -15,6 +16,18 @@ _SUCH = {
 """What makes such a moment wrong, mostly."""
 _MUCH = 1.5
 """Times as much that everything again costs from which that is told."""
+
+
+LEAVE_OUT = "Leave out the copies, readings that are in the data twice, and diagnose again: copies make gaps of their own."
+
+
+def is_read_twice(report: Report) -> bool:
+    """Whether readings are in the data twice, as those of a log that was read twice."""
+    return (
+        any(READ_TWICE in warning for warning in report["fit"].get("warnings", []))
+        if "fit" in report
+        else False
+    )
 
 
 def rivals(report: Report) -> list[list[str]]:
@@ -67,6 +80,8 @@ def _places(value: Any) -> str:
 
 def next_look(report: Report) -> str:
     """Where to look for an unknown cause: the block of the data that shows it most, the quantity that must change."""
+    if is_read_twice(report):
+        return LEAVE_OUT
     blocks, left = significant(report["where"]["coordinates"]), left_over(report)
     where = (
         f" at {block(max(blocks, key=lambda b: b['share'] or 0.0))}, where the gap shows most"

@@ -8,12 +8,13 @@ import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from dtprob.gap.vocabulary import READ_TWICE, UNSEEN
-from dtprob.report import names, units
+from dtprob.report import names, sizes, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Candidate, Interval, Report, Tried, is_quiet, validate
 from dtprob.report.next_step import left_over, next_look, next_step, rivals
 from dtprob.report.palette import DARK, LIGHT
+from dtprob.report.quiet import nearly
 from dtprob.report.story import tell
 
 FIRST = 12
@@ -58,6 +59,7 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
             rivals=rivals(checked),
             others=others(checked),
             left_over=left_over(checked),
+            nearly=nearly(checked),
             next_look=next_look(checked),
             charts={section: [chart for name, chart in charts if name == section] for section, _ in charts},
             candidates=candidates,
@@ -141,6 +143,7 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     names.site_words,
     names.located_words,
     names.place_words,
+    names.whereabouts,
     names.allowance,
     names.together,
     names.listing,
@@ -155,8 +158,8 @@ _FILTERS: tuple[Callable[..., Any], ...] = (
     bar,
 )
 _FUNCTIONS: tuple[Callable[..., Any], ...] = (
-    names.size_reading,
+    sizes.size_reading,
     names.user_terms,
-    names.apart,
+    sizes.apart,
     units.reading,
 )

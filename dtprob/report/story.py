@@ -3,10 +3,9 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from dtprob.gap.vocabulary import UNSEEN
-from dtprob.report.advice import ADVICE, family
-from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Cause, Detectable, Report, is_quiet
+from dtprob.report.advice import advice, worth_telling
+from dtprob.report.closest import beyond, closest, values_are_wrong
+from dtprob.report.json_schema import Cause, Report, is_quiet
 from dtprob.report.names import (
     LEVEL,
     aliases,
@@ -16,7 +15,6 @@ from dtprob.report.names import (
     located_words,
     shares,
     significant,
-    size_reading,
     spoken,
     term,
     together,
@@ -24,8 +22,10 @@ from dtprob.report.names import (
     whereabouts,
     words,
 )
-from dtprob.report.next_step import changed, decides, left_over, next_step, rivals
-from dtprob.report.units import DASH, percent
+from dtprob.report.next_step import LEAVE_OUT, changed, decides, is_read_twice, left_over, next_step, rivals
+from dtprob.report.quiet import nearly, nothing_found
+from dtprob.report.sizes import size_reading
+from dtprob.report.units import percent
 
 _NAMING = ("LISTED", "LISTED_WITH_REMAINDER")
 """Verdicts that name a cause."""
@@ -44,11 +44,19 @@ class Story:
 
 def tell(report: Report) -> Story:
     """The story of a report's verdict; its headline is the report's own summary where it has one."""
-    story = _STORIES[report["verdict"]](report)
+    story = _without_copies(_STORIES[report["verdict"]](report), report)
     headline = (
         _sentences(spoken(report["summary"], _codes(report))) if "summary" in report else story.headline
     )
     return replace(story, headline=headline)
+
+
+def _without_copies(story: Story, report: Report) -> Story:
+    """The story whose first step is to leave readings out that are in the data twice: they make gaps of their own."""
+    if not is_read_twice(report):
+        return story
+    rest = "" if is_quiet(report) else f" Should a gap remain, {story.action[:1].lower()}{story.action[1:]}"
+    return replace(story, action=f"{LEAVE_OUT}{rest}")
 
 
 def _sentences(text: str) -> str:
@@ -57,7 +65,7 @@ def _sentences(text: str) -> str:
 
 
 def _codes(report: Report) -> set[str]:
-    """All names of effects and sites that the report holds."""
+    """All names of effects, sites and axes that the report holds."""
     sets = [effects for cause in report["causes"] for effects in (cause["effects"], *cause["alias_class"])]
     screened = report.get("screening", [])
     located = [*(site["site"] for site in report["where"]["sites"]), *report["unlisted"]["sites"]]
@@ -66,40 +74,26 @@ def _codes(report: Report) -> set[str]:
         *(row["effect"] for row in screened),
         *(site for row in screened for site in row["sites"]),
         *located,
+        *(axis for block in report["where"]["coordinates"] for axis in block["axes"]),
     }
 
 
 def _no_gap(report: Report) -> Story:
     if not is_quiet(report):
         return _tolerated(report)
-    screened = report.get("screening", [])
-    untold = [row for row in screened if row.get("absorbed_by")]
-    unseen = sum(row.get("absorbed_by") == UNSEEN for row in untold)
-    judged = len(screened) - len(untold)
-    beside = ""
-    if absorbed := len(untold) - unseen:
-        more = " more" * (judged > 0)
-        beside = f" {absorbed}{more} could not be judged, because fitted parameters of the twin take up the same change."
-    if unseen:
-        beside += f" {unseen} could not be judged, because nothing that was observed depends on them."
+    near = nearly(report)
+    doubt = (
+        ""
+        if near is None
+        else f" More data of the same kind would tell whether the {located_words(near)} are right."
+    )
     return Story(
         "No gap found",
         "good",
         "Nothing found: the twin agrees with the data.",
-        f"{_tried(judged)}{beside} {_seen(report['detectable'])}"
-        if screened
-        else "No effects were given to try; the twin's own quantities differ from the data by no more than chance.",
-        "Nothing to change in the twin.",
+        nothing_found(report),
+        f"Nothing to change in the twin.{doubt}",
     )
-
-
-def _tried(judged: int) -> str:
-    """That so many effects were tried and none is needed."""
-    if not judged:
-        return "No known effect could be tried; nothing was left over."
-    one = "1 known effect was tried; it is not"
-    many = f"{judged} known effects were tried; none of them is"
-    return f"{one if judged == 1 else many} needed to explain these data, and nothing else was left over."
 
 
 def _tolerated(report: Report) -> Story:
@@ -114,14 +108,6 @@ def _tolerated(report: Report) -> Story:
         f"you said does not matter: {errors}.{best}",
         "Nothing to change in the twin for this tolerance.",
     )
-
-
-def _seen(detectable: list[Detectable]) -> str:
-    families = [entry for entry in detectable_families(detectable) if entry.size != DASH]
-    some = [f"{entry.name} of {entry.size}" for entry in families[:3]]
-    if not some:
-        return "How large an effect would have been seen is not known."
-    return f"Effects of these sizes would have been seen nine times in ten: {listing(some)}. Smaller ones may be there."
 
 
 def _listed(report: Report) -> Story:
@@ -168,7 +154,7 @@ def _unlisted(report: Report) -> Story:
     left = left_over(report)
     look = (
         "Look for physics that the twin lacks where the gap lies, and declare it as a new effect."
-        if not left or any("moment" not in site for site in left)
+        if not left or values_are_wrong(report)
         else "The values that the twin computes show nothing wrong; what it says of its errors does. Look for what "
         f"could {changed(left[:2])}, or declare errors that are so."
     )
@@ -181,7 +167,8 @@ def _unlisted(report: Report) -> Story:
         "unknown",
         "There is a gap, and none of the known effects explains it.",
         f"{real}, but no effect on the list accounts for it: something remains with the best of them, too.",
-        f"Do not add a listed effect: it would hide the problem, not solve it. {look}{_opposite(report)}{_beyond(report)}",
+        f"{closest(report)}Do not add a listed effect: it would hide the problem, not solve it. {look}{_opposite(report)}"
+        f"{beyond(report)}",
     )
 
 
@@ -196,19 +183,6 @@ def _opposite(report: Report) -> str:
     more, its = " even more" * bool(named), "its size is" if len(asked) == 1 else "their sizes are"
     return (
         f" The data ask{more} for the opposite of {listing(asked[:3])}: look whether {its} of the right sign."
-    )
-
-
-def _beyond(report: Report) -> str:
-    """The effect that the data ask for most, where they ask for more of it than its prior allows."""
-    rows = [row for row in report.get("screening", []) if row["z"] is not None and not row.get("absorbed_by")]
-    most = max(rows, key=lambda row: abs(row["z"] or 0.0), default=None)
-    far = most.get("beyond") if most is not None else None
-    if most is None or far is None or most.get("opposite"):
-        return ""
-    return (
-        f" Most of all the data ask for {words(most['effect'])}, but {far:.0f} times the size that its prior calls usual:"
-        " if it can be so large, give it a wider prior and diagnose again."
     )
 
 
@@ -270,19 +244,14 @@ def _closing(cause: Cause) -> str:
 
 
 def _change(cause: Cause) -> str:
-    changes = "; ".join(advice(effect) for effect in cause["effects"])
-    sizes = [size_reading(*item) for item in cause["size"].items()]
+    changes = "; ".join(advice(effect, cause["size"]) for effect in cause["effects"])
+    sizes = [size_reading(*item) for item in worth_telling(cause["effects"], cause["size"]).items()]
     if len(sizes) == 1:
         estimate = f" Estimate: {sizes[0][0]} {sizes[0][1]}."
     else:
         shown = listing(f"{label} {value.mean_with_unit}" for label, value in sizes[:4]) if sizes else ""
         estimate = f" Estimates: {shown}." if 1 < len(sizes) <= 4 else ""
     return f"{capital(changes)}.{estimate}"
-
-
-def advice(effect: str) -> str:
-    """What to do about an effect, as an imperative without capital and full stop."""
-    return ADVICE.get(family(effect), f"add {words(effect)}, with its estimated size, to the twin")
 
 
 def _seat(report: Report) -> str:

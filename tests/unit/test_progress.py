@@ -3,7 +3,9 @@
 import io
 import os
 import sys
+import time
 
+from dtprob.commands import progress
 from dtprob.commands.progress import telling
 
 
@@ -34,3 +36,16 @@ def test_the_work_goes_on_where_standard_output_is_closed(monkeypatch):
     monkeypatch.setattr(sys, "stdout", None)
     with telling() as say:
         say("a step")
+
+
+def test_a_long_step_is_told_again(monkeypatch, capsys):
+    monkeypatch.setattr(progress, "SILENCE", 0.05)
+    with telling() as say:
+        say("screening 209 effects")
+        say("note: a prior is wrong")
+        time.sleep(0.5)
+    told = capsys.readouterr().out.splitlines()
+    assert told[1].endswith("note: a prior is wrong")
+    assert told[2].endswith("still at: screening 209 effects")
+    time.sleep(0.2)
+    assert not capsys.readouterr().out

@@ -346,3 +346,28 @@ def test_the_remainder_is_told_with_its_calibration(examples: dict[str, Any]) ->
     outcomes = Page(render(report, None, title="x")).text
     assert "What is left, modelled where it shows" in outcomes
     assert "as uncertain as they say" not in outcomes
+
+
+def test_what_came_near_to_a_gap_is_where_it_lies(examples: dict[str, Any]) -> None:
+    report = examples["NO_GAP"]()
+    assert "agree with the twin everywhere" in Page(render(report, None, title="x")).text
+    report["where"]["sites"] = [
+        {"site": "predicted_label", "p_value": 0.0064, "share": 1.0, "whereabouts": "along x[0]"}
+    ]
+    text = Page(render(report, None, title="x")).text
+    assert "agree with the twin everywhere" not in text
+    assert "predicted labels (along x[0]) came nearest to a gap (p = 0.0064)" in text
+
+
+def test_which_gap_is_closed_is_said(page: str) -> None:
+    assert "avoidable error that the twin's own quantities and the candidates can see" in Page(page).text
+
+
+def test_sizes_are_told_as_they_are_meant(examples: dict[str, Any]) -> None:
+    report = examples["UNDETERMINED"]()
+    meaning = {"words": "slots in which its radio is off", "told_as": "share"}
+    size = {"mean": 0.478, "low": 0.315, "high": 0.647, "unit": "1", "meaning": meaning}
+    report["causes"][0] |= {"size": {"sleep": size}, "strata": {"estimate": [0.4, 0.5]}}
+    text = Page(render(report, None, title="x")).text
+    assert re.search(r"Slots in which its radio is off 38% ?27 to 48%", text)
+    assert "without another part of the data: 33 and 39%" in text

@@ -8,7 +8,7 @@ from typing import Any, Final
 import numpy as np
 import numpyro.distributions as dist
 
-from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
+from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers, told
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.network.laws import (
     ClustersLike,
@@ -46,7 +46,8 @@ def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
         if clusters.devices <= _MOST_ONSETS
         else ()
     )
-    onset = (Parameter("onset", dist.Normal(0.0, 0.5), is_place=True, tried=tried),) if lasts else ()
+    since = Parameter("onset", dist.Normal(0.0, 0.5), is_place=True, tried=tried)
+    onset = (told(since, "part of the log before that", "percent"),) if lasts else ()
     effects: list[Effect] = []
     for device in range(clusters.devices):
 
@@ -60,7 +61,7 @@ def device_disconnected(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "device_disconnected",
                 {"arrival_logits": thin},
-                (half_normal("loss", 3.0), *onset),
+                (told(half_normal("loss", 3.0), "packets that are missing", "share"), *onset),
                 instance=f"device_{device}",
                 physics=f"Each packet of device {device} is not generated with probability 1 - exp(-loss)"
                 + (", after a share `onset` of the log." if lasts else "."),
@@ -81,7 +82,7 @@ def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
         Effect(
             "arrival_rate_shift",
             {"arrival_logits": lambda value, p, _: value + p["log_odds"] * total},
-            (normal("log_odds", 1.0),),
+            (told(normal("log_odds", 1.0), "factor of the odds of a packet", "factor"),),
             physics="The odds of an arrival at all devices change by a factor.",
             source="Exponential tilt of the joint arrivals: P(a) exp(c n(a)).",
             requires=("clusters",),
@@ -96,7 +97,7 @@ def arrival_rate_shift(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "arrival_rate_shift",
                 {"arrival_logits": add},
-                (half_normal("extra", 1.0),),
+                (told(half_normal("extra", 1.0), "empty slots that get a packet", "share"),),
                 instance=f"device_{device}",
                 physics=f"Device {device} generates a packet with probability 1 - exp(-extra) where it would have none; "
                 "fewer packets are `device_disconnected`.",
@@ -123,7 +124,7 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "bursty_traffic",
                 {"arrival_logits": follow},
-                (half_normal("persistence", 1.0),),
+                (told(half_normal("persistence", 1.0), "slots that repeat the last one", "share"),),
                 instance=f"device_{device}",
                 physics=f"Device {device} repeats its last slot with probability 1 - exp(-persistence); its load stays.",
                 source="Discrete autoregression of order one (Jacobs and Lewis, J. R. Stat. Soc. B 40 (1978) 94).",
@@ -135,7 +136,7 @@ def bursty_traffic(sites: Sites, data: Data) -> list[Effect]:
         Effect(
             "bursty_traffic",
             {"arrival_logits": lambda value, p, _: value + p["scale"] * p[FIELD] * total},
-            (half_normal("scale", 1.0),),
+            (told(half_normal("scale", 1.0), "spread of the log-odds of packets between windows"),),
             instance="each_window",
             kind="variance",
             physics="The load differs at random between windows.",
@@ -163,7 +164,7 @@ def closed_loop_traffic(sites: Sites, data: Data) -> list[Effect]:
             Effect(
                 "closed_loop_traffic",
                 {"arrival_logits": answer},
-                (normal("log_odds", 1.0),),
+                (told(normal("log_odds", 1.0), "factor of the odds of a packet after a delivery", "factor"),),
                 instance=f"device_{device}",
                 physics=f"The odds of a packet of device {device} change in the slot after one of its own was delivered.",
                 source="Closed-loop sources: Schroeder, Wierman and Harchol-Balter, NSDI (2006).",
@@ -200,7 +201,7 @@ def _passed_on(clusters: ClustersLike, i: int, j: int) -> Effect:
     return Effect(
         "cross_cluster_traffic",
         {"arrival_logits": forward},
-        (half_normal("passed", 1.0),),
+        (told(half_normal("passed", 1.0), "packets that are passed on", "share"),),
         instance=f"{i}_to_{j}",
         physics=f"A packet of device {i} in the slot before is passed on to device {j} with probability 1 - exp(-passed).",
         source="Superposition: P(a) of outcomes without the device moves to those with it.",
@@ -218,7 +219,11 @@ def _coupled(clusters: ClustersLike, i: int, j: int) -> Effect:
     return Effect(
         "cross_cluster_traffic",
         {"arrival_logits": couple},
-        (normal("log_odds", 1.0),),
+        (
+            told(
+                normal("log_odds", 1.0), "factor of the odds of a packet beside the other device's", "factor"
+            ),
+        ),
         instance=f"{i}_with_{j}",
         physics=f"An arrival at device {i} in the same slot changes the odds of one at device {j}.",
         source="Log-linear interaction: P(a_j | the others) tilted by c (a_i[t] - 1/2).",
@@ -234,19 +239,22 @@ def drift(sites: Sites, data: Data) -> list[Effect]:
     effects: list[Effect] = []
     for device in range(clusters.devices):
         more, fewer = "a packet where it would have none", "no packet where it would have one"
-        for change, name, what in ((joined, "", more), (thinned, "_falling", fewer)):
+        extra, lost = "empty slots that get a packet at the end", "packets that are missing at the end"
+        for change, name, what, meaning in ((joined, "", more, extra), (thinned, "_falling", fewer, lost)):
             text = (
                 f"Device {device} generates {what}: with probability 1 - exp(-amount) by the end of the log."
             )
             grow = {"arrival_logits": _growing(clusters, device, change)}
-            effects.append(_drift(grow, half_normal("amount", 1.0), f"device_{device}{name}", text))
+            amount = told(half_normal("amount", 1.0), meaning, "share")
+            effects.append(_drift(grow, amount, f"device_{device}{name}", text))
     if offers(sites, "reception_logits"):
 
         def fade(value: Any, p: Mapping[str, Any], _: Mapping[str, Any]) -> Any:
             return value + p["log_odds"] * progress(value.shape[0])[..., None] * np.arange(value.shape[2])
 
         text = "The log-odds of each delivery change linearly, by this over the whole log."
-        effects.append(_drift({"reception_logits": fade}, normal("log_odds", 1.0), "reception", text))
+        size = told(normal("log_odds", 1.0), "factor of the odds of each delivery at the end", "factor")
+        effects.append(_drift({"reception_logits": fade}, size, "reception", text))
     return effects
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Array, Float
 
-from dtprob.effects.common import Data, Family, Sites, half_normal, offers
+from dtprob.effects.common import Data, Family, Sites, half_normal, offers, told
 from dtprob.effects.effect import FIELD, Effect, Parameter
 from dtprob.effects.network.laws import at, mix
 from dtprob.effects.network.slots import Other, likelihood_ratio, mixed, one_fewer, sender_count, sends
@@ -46,7 +46,10 @@ def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
         Effect(
             "bursty_channel",
             {"reception_logits": _at_times(silence, "loss")},
-            (half_normal("loss", 0.5), _DURATION),
+            (
+                told(half_normal("loss", 0.5), "slots in outages", "share"),
+                told(_DURATION, "slots of an outage", "factor"),
+            ),
             physics="Nothing is heard in a share 1 - exp(-loss) of the slots, in outages of about exp(log_duration) slots.",
             source="Channel of Gilbert (1960) and Elliott (1963), " + _FILTER,
             requires=("sending", "deliveries", "log_reception"),
@@ -58,7 +61,7 @@ def bursty_channel(sites: Sites, _data: Data) -> list[Effect]:
                     value + p["scale"] * p[FIELD] * np.arange(value.shape[-1])
                 )
             },
-            (half_normal("scale", 1.0),),
+            (told(half_normal("scale", 1.0), "spread of the log-odds of deliveries between windows"),),
             instance="each_window",
             kind="variance",
             physics="The channel differs at random between windows.",
@@ -91,7 +94,10 @@ def _stranger(other: Other) -> Effect:
     return Effect(
         "interferer",
         {"reception_logits": _at_times(other, "activity")},
-        (half_normal("activity", 0.5), _DURATION),
+        (
+            told(half_normal("activity", 0.5), "slots in which it sends", "share"),
+            told(_DURATION, "slots of a bout", "factor"),
+        ),
         physics="In a share 1 - exp(-activity) of the slots, in bouts of about exp(log_duration) slots,"
         " one sender more takes part.",
         source=f"{_ONE_MORE}; the bouts are a {_FILTER}",
@@ -103,7 +109,7 @@ def _stranger_near(device: int, other: Other) -> Effect:
     return Effect(
         "interferer",
         {"reception_logits": mixed(other, "activity")},
-        (half_normal("activity", 0.5),),
+        (told(half_normal("activity", 0.5), "slots of the device in which it sends", "share"),),
         instance=f"device_{device}",
         physics=f"In a share 1 - exp(-activity) of the slots in which device {device} sends one sender more takes part.",
         source=f"{_ONE_MORE}.",

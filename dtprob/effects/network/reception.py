@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers
+from dtprob.effects.common import Data, Family, Sites, half_normal, normal, offers, told
 from dtprob.effects.effect import Effect
 from dtprob.effects.network.laws import at
 from dtprob.effects.network.slots import mixed, sender_count
@@ -29,12 +29,14 @@ def reception_shift(sites: Sites, _data: Data) -> list[Effect]:
                 change = change + p["log_odds_of_further"] * np.maximum(deliveries - 1, 0)
             return value + (sender_count(context) == count)[..., None] * change
 
-        further = (normal("log_odds_of_further", 1.0),) if count > 1 else ()
+        first = told(normal("log_odds_of_any", 1.0), "factor of the odds of a delivery", "factor")
+        more = told(normal("log_odds_of_further", 1.0), "factor of the odds of each further one", "factor")
+        further = (more,) if count > 1 else ()
         effects.append(
             Effect(
                 "reception_shift",
                 {"reception_logits": tilt},
-                (normal("log_odds_of_any", 1.0), *further),
+                (first, *further),
                 instance=f"{count}_senders",
                 physics=f"The odds of a delivery, and of each further one, change when {count} devices send.",
                 source="Exponential tilt: P(d) exp(a [d > 0] + c max(d - 1, 0)).",
@@ -60,7 +62,7 @@ def capture(sites: Sites, _data: Data) -> list[Effect]:
         Effect(
             "capture",
             {"reception_logits": mixed(other, "capture")},
-            (half_normal("capture", 1.0),),
+            (told(half_normal("capture", 1.0), "collisions that a packet survives", "share"),),
             physics="With probability 1 - exp(-capture) one packet of a collision without delivery is received.",
             source="Capture effect: Zorzi and Rao, IEEE J. Sel. Areas Commun. 12 (1994).",
             requires=("sending",),
@@ -81,7 +83,7 @@ def near_far(sites: Sites, _data: Data) -> list[Effect]:
                     value + p["advantage"] * at(device, devices)
                 )
             },
-            (normal("advantage", 1.0),),
+            (told(normal("advantage", 1.0), "factor of the odds to be heard rather than another", "factor"),),
             instance=f"device_{device}",
             physics=f"Log-odds that device {device} is delivered rather than another sender.",
             source="Conditional Bernoulli law of the delivered set: Chen and Liu, Statistica Sinica 7 (1997).",

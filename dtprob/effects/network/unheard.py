@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from dtprob.effects.common import Data, Family, Sites, half_normal, offers
-from dtprob.effects.effect import Effect
+from dtprob.effects.common import Data, Family, Sites, half_normal, offers, told
+from dtprob.effects.effect import Effect, Parameter
 from dtprob.effects.network.laws import at
 from dtprob.effects.network.slots import likelihood_ratio, mixed, one_fewer, sender_count, sends
 
@@ -30,7 +30,7 @@ def ack_loss(sites: Sites, _data: Data) -> list[Effect]:
     return _unheard(
         sites,
         "ack_loss",
-        "loss",
+        told(half_normal("loss", 0.5), "deliveries that are not acknowledged", "share"),
         other,
         physics="A delivery of device {device} goes unacknowledged with probability 1 - exp(-loss).",
         source="Thinning of the deliveries; exact for one delivery per slot.",
@@ -47,7 +47,7 @@ def duty_cycle(sites: Sites, _data: Data) -> list[Effect]:
     return _unheard(
         sites,
         "duty_cycle",
-        "sleep",
+        told(half_normal("sleep", 0.5), "slots in which its radio is off", "share"),
         other,
         physics="Device {device} does not transmit in a share 1 - exp(-sleep) of the slots in which it is to.",
         source="P_s becomes P_{s-1}, and none of the deliveries is the device's.",
@@ -57,7 +57,7 @@ def duty_cycle(sites: Sites, _data: Data) -> list[Effect]:
 def _unheard(
     sites: Sites,
     family: str,
-    parameter: str,
+    size: Parameter,
     other: Unheard,
     *,
     physics: str,
@@ -68,7 +68,7 @@ def _unheard(
     Args:
         sites: what the model offers.
         family: of the effects, one per device.
-        parameter: its share of slots is 1 - exp(-parameter).
+        size: of the effect; its share of slots is 1 - exp(-size).
         other: (logits, context, device) -> probabilities of the number of deliveries in those slots.
         physics: with {device} where the device's number belongs.
         source: of the formula.
@@ -81,12 +81,12 @@ def _unheard(
         return Effect(
             family,
             {
-                "reception_logits": mixed(lambda value, context: other(value, context, device), parameter),
+                "reception_logits": mixed(lambda value, context: other(value, context, device), size.name),
                 "device_advantage": lambda value, p, context: (
-                    value + _set_back(p[parameter], context, device, other)[..., None] * at(device, devices)
+                    value + _set_back(p[size.name], context, device, other)[..., None] * at(device, devices)
                 ),
             },
-            (half_normal(parameter, 0.5),),
+            (size,),
             instance=f"device_{device}",
             physics=physics.format(device=device),
             source=source,

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from dtprob.effects.effect import FIELD, Effect, Parameter
+from dtprob.effects.effect import FIELD, Effect, Meaning, Parameter
 from dtprob.effects.rewriting import with_effects
 from dtprob.gap.diagnosis import Size
 from dtprob.gap.fitting import fit as fitting
@@ -121,8 +121,16 @@ def _sizes(parameter: Parameter, draws: np.ndarray, prefix: str) -> list[Size]:
     for j, label in enumerate(labels):
         low, high = np.quantile(flat[:, j], [0.05, 0.95])
         name = f"{prefix}{parameter.name}{label}{_suffix(parameter.unit)}"
-        result.append(Size(name, float(flat[:, j].mean()), float(low), float(high), parameter.unit))
+        mean, meaning = float(flat[:, j].mean()), _meaning(parameter, label)
+        result.append(Size(name, mean, float(low), float(high), parameter.unit, meaning))
     return result
+
+
+def _meaning(parameter: Parameter, label: str) -> Meaning | None:
+    """What an entry means to people: its label follows what all of them are."""
+    if parameter.meaning is None or not label:
+        return parameter.meaning
+    return replace(parameter.meaning, words=f"{parameter.meaning.words}{label.replace('_', ' ')}")
 
 
 def _labels(parameter: Parameter) -> Sequence[str]:
@@ -148,7 +156,7 @@ def _spread(problem: Problem, fitted: fitting.Fit, effect: Effect, prefix: str) 
             middle = fitted.spread[effect.name]
             low, high = interval_of_spread(problem, fitted, effect.name)
         name = f"{prefix}{parameter.name}{_suffix(parameter.unit)}"
-        found.append(Size(name, middle, low, high, parameter.unit))
+        found.append(Size(name, middle, low, high, parameter.unit, parameter.meaning))
     return found
 
 

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from dtprob.effects import catalogue
+from dtprob.effects import Meaning, catalogue
 from dtprob.effects.network import FAMILIES
 from dtprob.effects.network.laws import last_arrival, tilted
 from dtprob.effects.rewriting import Rewriting
@@ -333,3 +333,17 @@ def test_who_is_heard_where_one_is_not(offered, data, name):
             np.testing.assert_allclose(own, exact, atol=1e-6)
             seen += 1
     assert seen > 0
+
+
+def test_every_size_says_what_it_means(offered):
+    """A share of slots is not told as the number whose exponential it is."""
+    effects = [effect for effect in offered.values() if effect.family in FAMILIES]
+    assert {effect.family for effect in effects} == set(FAMILIES)
+    for parameter in (p for effect in effects for p in effect.parameters):
+        assert parameter.meaning is not None
+        assert (parameter.meaning.told_as == "factor") == (
+            parameter.name.startswith("log_") or parameter.name == "advantage"
+        )
+    assert offered["duty_cycle[device_1]"].parameters[0].meaning == Meaning(
+        "slots in which its radio is off", "share"
+    )

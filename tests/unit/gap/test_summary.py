@@ -4,9 +4,12 @@ from types import SimpleNamespace
 
 import pytest
 
-from dtprob.gap.compose import summary
+from dtprob.effects import Meaning
+from dtprob.gap.compose import spreads_only, summary
+from dtprob.gap.diagnosis import Cause, Diagnosis, Size
 from dtprob.gap.how_far.closed import ClosedFraction
 from dtprob.gap.located import site_shares, unlisted
+from dtprob.gap.where.coordinates import CoordinateFinding
 from dtprob.gap.where.locate import Location
 from dtprob.gap.where.site_finding import SiteFinding
 
@@ -58,7 +61,8 @@ def test_what_imitates_part_of_an_unknown_cause_is_said(effects, said):
     cause = SimpleNamespace(
         effects=effects, alias_class=(effects,), closed_fraction=ClosedFraction(0.4, 0.2, 0.6)
     )
-    evidence = SimpleNamespace(after=Location((), (), {}, 1e-9), problem=SimpleNamespace(effects=("a", "b")))
+    nowhere = Location((), (), {}, 1e-9)
+    evidence = SimpleNamespace(before=nowhere, after=nowhere, problem=SimpleNamespace(effects=("a", "b")))
     assert summary("UNLISTED", (cause,), evidence).endswith(f" {said} part of it.")
     cause.closed_fraction = None  # not established that it closes anything
     assert "part of it" not in summary("UNLISTED", (cause,), evidence)
@@ -94,7 +98,46 @@ def test_it_is_said_where_a_site_is_wrong():
         ),
         SiteFinding("y", "spread", "ripple in day, 9 to 16 half waves", 1e-9, None),
     )
-    evidence = SimpleNamespace(after=Location(sites, (), {}, 1e-9), problem=SimpleNamespace(effects=()))
+    blocks = (CoordinateFinding("rx_antenna", 1, 2, 1e-22, 40.0), CoordinateFinding("link", 6, 6, 1e-17, 9.0))
+    here = Location(sites, blocks, {}, 1e-9)
+    evidence = SimpleNamespace(before=here, after=here, problem=SimpleNamespace(effects=()))
     assert summary("UNLISTED", (), evidence).endswith(
         " It shows at mean (slot 408 to 435), the spread of y; most of it at slot 410."
     )
+    bare = (SiteFinding("rx_response", "conjugate", "stretch of link x rx_antenna", 1e-9, 9.0),)
+    for found, said in ((blocks, ", and in the data most at rx_antenna 1 to 2."), ((), "rx_response.")):
+        here = Location(bare, found, {}, 1e-9)
+        evidence = SimpleNamespace(before=here, after=here, problem=SimpleNamespace(effects=()))
+        assert summary("UNLISTED", (), evidence).endswith(said)
+
+
+def test_sites_that_only_spread_say_so():
+    found = [
+        SiteFinding(name, "relative", "link", 1e-9, 9.0, spreads=name == "noise")
+        for name in ("noise", "gain")
+    ]
+    left = unlisted(Location(tuple(found), (), {}, 1e-9), 0.005)
+    assert [site.get("spreads", False) for site in left["located"]] == [True, False]
+
+
+def test_what_a_size_means_is_in_the_report():
+    meaning = Meaning("slots in which its radio is off", "share")
+    size = Size("sleep", 0.478, 0.3, 0.6, "1", meaning)
+    cause = Cause(("a",), (("a",),), 1.0, (size,), None, None, 1.0, (), "", (), plausible=True)
+    told = Diagnosis("LISTED", "", (cause,), {}, {}).to_report()["causes"][0]["size"]["sleep"]
+    assert told["meaning"] == {"words": meaning.words, "told_as": "share"}
+
+
+def test_noise_spreads_and_fields_where_their_sites_do():
+    noise = SiteFinding("noise_power", "relative", "common", 0.2, 1.0, spreads=True)
+    gain = SiteFinding("path_gain", "relative", "common", 0.2, 1.0)
+    observed = SimpleNamespace(declaration=SimpleNamespace(observed={"channel": None}))
+    evidence = SimpleNamespace(before=Location((noise, gain), (), {}, 0.2), problem=observed)
+    for kind, site, locates, only in (
+        ("mean", "path_gain", True, False),
+        ("mean", "channel", False, True),
+        ("variance", "noise_power", False, True),
+        ("variance", "path_gain", False, False),
+    ):
+        effect = SimpleNamespace(kind=kind, sites=(site,))
+        assert spreads_only(effect, evidence, locates=locates) == only

@@ -3,14 +3,14 @@
 import pytest
 
 from dtprob.effects import summaries
-from dtprob.gap.vocabulary import UNSEEN
-from dtprob.report import names
-from dtprob.report.advice import ADVICE, family
+from dtprob.gap.vocabulary import READ_TWICE, UNSEEN
+from dtprob.report import names, sizes
+from dtprob.report.advice import ADVICE, advice, family
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Cause, Detectable
 from dtprob.report.next_step import left_over, next_look, next_step
 from dtprob.report.page import bar, ranked
-from dtprob.report.story import advice, tell
+from dtprob.report.story import tell
 
 
 def _cause(*effects: str, alias: list[list[str]] | None = None) -> Cause:
@@ -72,7 +72,7 @@ def test_user_terms_share_unit_and_decimals() -> None:
 
 
 def test_estimates_of_strata_share_the_unit_of_the_size() -> None:
-    shown = names.apart("delay_s", {"mean": 1e-9, "low": 0.9e-9, "high": 1.1e-9}, [0.98e-9, 1.03e-9])
+    shown = sizes.apart("delay_s", {"mean": 1e-9, "low": 0.9e-9, "high": 1.1e-9}, [0.98e-9, 1.03e-9])
     assert shown == "0.98 and 1.03\u202fns"
 
 
@@ -98,25 +98,25 @@ def test_detectable_sizes_of_a_family_are_its_worst() -> None:
 
 def test_sizes_drop_the_unit_of_their_key() -> None:
     interval = {"mean": 0.1, "low": 0.05, "high": 0.15}
-    label, shown = names.size_reading("array_calibration[rx_1].log_gain_Np", {**interval, "unit": "Np"})
+    label, shown = sizes.size_reading("array_calibration[rx_1].log_gain_Np", {**interval, "unit": "Np"})
     assert label == "array calibration (rx 1): gain"
     assert (shown.mean, shown.unit) == ("0.87", "dB")
-    assert names.size_reading("velocity_x_m_per_s", {**interval, "unit": "m/s"})[0] == "velocity x"
-    assert names.size_reading("scale_rad_per_s0.5", {**interval, "unit": "rad/s^0.5"})[0] == "scale"
-    assert names.size_reading("delay_s", interval)[0] == "delay"
-    assert names.size_reading("gps.metres_1", {**interval, "unit": "1"})[0] == "gps: metres 1"
+    assert sizes.size_reading("velocity_x_m_per_s", {**interval, "unit": "m/s"})[0] == "velocity x"
+    assert sizes.size_reading("scale_rad_per_s0.5", {**interval, "unit": "rad/s^0.5"})[0] == "scale"
+    assert sizes.size_reading("delay_s", interval)[0] == "delay"
+    assert sizes.size_reading("gps.metres_1", {**interval, "unit": "1"})[0] == "gps: metres 1"
 
 
 def test_a_logarithm_is_told_as_a_factor() -> None:
     size: names.Size = {"mean": 0.7, "low": 0.6, "high": 0.8, "unit": "1"}
-    label, shown = names.size_reading("label_noise[x0_low].log_ratio", size)
+    label, shown = sizes.size_reading("label_noise[x0_low].log_ratio", size)
     assert (label, shown.mean, shown.low, shown.high) == (
         "label noise (x0 low): ratio",
         "2.01",
         "1.82",
         "2.23",
     )
-    assert names.apart("log_ratio", size, [0.6, 0.8]) == "1.82 and 2.23"
+    assert sizes.apart("log_ratio", size, [0.6, 0.8]) == "1.82 and 2.23"
 
 
 def test_code_names_in_sentences_become_words() -> None:
@@ -479,3 +479,97 @@ def test_what_cannot_be_told_apart_is_listed(others: list[list[str]], told: str)
     cause = {**_report()["causes"][0], "effects": ["clipping"], "alias_class": others}
     report = {**_report(), "verdict": "UNDETERMINED", "causes": [cause], "next_measurement": None}
     assert tell(report).headline == f"There is a gap, but the data {told}"
+
+
+def test_what_came_near_to_a_gap_is_said_with_its_place() -> None:
+    site = {"site": "predicted_label", "p_value": 0.0064, "share": 1.0, "whereabouts": "along x[0]"}
+    report = {**_report(), "verdict": "NO_GAP", "causes": []}
+    for p, near in ((0.0064, True), (0.2, False)):
+        story = tell({**report, "where": {"sites": [{**site, "p_value": p}], "coordinates": []}})
+        assert (
+            "left in the predicted labels (along x[0]) may be more than chance (p = 0.0064)" in story.meaning
+        ) == near
+        assert ("nothing else was left over" in story.meaning) != near
+        assert ("More data of the same kind" in story.action) == near
+        bare = {**report, "screening": [], "where": {"sites": [{**site, "p_value": p}], "coordinates": []}}
+        assert ("by no more than chance" in tell(bare).meaning) != near
+
+
+NOISE = {
+    "effect": "heavy_tailed_noise",
+    "sites": ["channel"],
+    "z": 121.5,
+    "p_value": 0.0,
+    "adjusted_p_value": 0.0,
+}
+VALUES: names.Site = {"site": "path_gain", "p_value": 1e-9, "share": None, "family": "relative, link x path"}
+
+
+def _reflecting() -> names.Any:
+    rows = [{**NOISE, "beyond": 11.9, "spreads": True}]
+    rows += [{**NOISE, "effect": name, "z": 18.0} for name in ("path_gain_error", "extra_path[anywhere]")]
+    cause = _cause("path_gain_error", "extra_path[anywhere]")
+    size = {"mean": 38.1, "low": 37.6, "high": 38.6, "unit": "m"}
+    there = {"x": size, "y": {**size, "mean": 13.1, "low": 12.6, "high": 13.6}}
+    cause["size"] = {f"extra_path[anywhere].{axis}_m": one for axis, one in there.items()}
+    return {**_unlisted(VALUES), "screening": rows, "causes": [cause]}
+
+
+def test_noise_leads_nobody_where_values_are_wrong() -> None:
+    """It resembles whatever is wrong; what moves the values, and where, is what to look at."""
+    report = _reflecting()
+    action = tell(report).action
+    assert "heavy tailed noise" not in action
+    assert action.startswith("Look first at what came closest")
+    assert "extra path (anywhere), at x 38.1\u202fm and y 13.1\u202fm. " in action
+    report["causes"] = [_cause("heavy_tailed_noise")]
+    assert "closest, though it does not explain all: path gain error. " in tell(report).action
+    spread: names.Site = {"site": "noise_power", "p_value": 1e-9, "share": None, "spreads": True}
+    hidden = {**report, **{key: _unlisted(spread)[key] for key in ("unlisted", "where")}}
+    assert "Look first" not in tell(hidden).action
+    assert "could change the noise level, or declare errors that are so" in tell(hidden).action
+    assert "ask for heavy tailed noise, but 12 times" in tell(hidden).action
+
+
+def test_copies_are_left_out_before_anything_else() -> None:
+    """They make gaps of their own, which no physics explains."""
+    report = _unlisted(VALUES)
+    report["fit"] = {
+        "nuisances": [],
+        "converged": True,
+        "warnings": [f"90 of 630 values are others again: {READ_TWICE}"],
+    }
+    assert tell(report).action.startswith("Leave out the copies")
+    assert "Should a gap remain, do not add a listed effect" in tell(report).action
+    assert next_look(report).startswith("Leave out the copies")
+    quiet = {**report, "verdict": "NO_GAP"}
+    assert tell(quiet).action.endswith("of their own.")
+    report["fit"]["warnings"] = ["something else"]
+    assert "copies" not in tell(report).action + next_look(report)
+
+
+def test_an_element_is_dead_or_out_of_calibration() -> None:
+    size: names.Any = {"low": 0.9, "high": 1.1, "unit": "1"}
+    phase = {"phase_rad": {"mean": 0.2, "low": -0.5, "high": 0.9, "unit": "rad"}}
+    for lacks, dead in ((0.995, True), (0.4, False)):
+        cause = _cause("array_calibration[rx_2]")
+        cause["size"] = {"fraction": {**size, "mean": lacks}, **phase}
+        action = tell({**_report(), "causes": [cause]}).action
+        assert ("dead or its cable is off" in action) == dead
+        assert ("Calibrate the element" in action) != dead
+        assert ("phase" in action.partition("Estimate")[2]) != dead
+    assert advice("array_calibration[rx]").startswith("apply the estimated gain and phase to each antenna")
+
+
+def test_a_radio_that_sleeps_is_to_be_checked() -> None:
+    assert advice("duty_cycle[device_1]").startswith("check whether the device's radio is off")
+    assert "in the twin" in advice("duty_cycle[device_1]")
+
+
+def test_axes_in_the_summary_are_words() -> None:
+    report = {
+        **_unlisted(VALUES),
+        "summary": "It shows at path_gain, and in the data most at rx_antenna 1 to 2.",
+    }
+    report["where"]["coordinates"] = [{"axes": {"rx_antenna": (1, 2)}, "p_value": 1e-9, "share": 0.2}]
+    assert tell(report).headline == "It shows at path gains, and in the data most at receive antenna 1 to 2."
