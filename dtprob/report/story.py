@@ -29,6 +29,8 @@ from dtprob.report.units import DASH, percent
 
 _NAMING = ("LISTED", "LISTED_WITH_REMAINDER")
 """Verdicts that name a cause."""
+_SPELT = 3
+"""Effects that could not be judged up to which they are named, not counted."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +50,7 @@ def tell(report: Report) -> Story:
     headline = (
         _sentences(spoken(report["summary"], _codes(report))) if "summary" in report else story.headline
     )
-    return replace(story, headline=headline)
+    return replace(story, headline=headline, meaning=f"{story.meaning}{_unjudged(report)}")
 
 
 def _sentences(text: str) -> str:
@@ -73,24 +75,34 @@ def _no_gap(report: Report) -> Story:
     if not is_quiet(report):
         return _tolerated(report)
     screened = report.get("screening", [])
-    untold = [row for row in screened if row.get("absorbed_by")]
-    unseen = sum(row.get("absorbed_by") == UNSEEN for row in untold)
-    judged = len(screened) - len(untold)
-    beside = ""
-    if absorbed := len(untold) - unseen:
-        more = " more" * (judged > 0)
-        beside = f" {absorbed}{more} could not be judged, because fitted parameters of the twin take up the same change."
-    if unseen:
-        beside += f" {unseen} could not be judged, because nothing that was observed depends on them."
+    judged = sum(not row.get("absorbed_by") for row in screened)
     return Story(
         "No gap found",
         "good",
         "Nothing found: the twin agrees with the data.",
-        f"{_tried(judged)}{beside} {_seen(report['detectable'])}"
+        f"{_tried(judged)} {_seen(report['detectable'])}"
         if screened
         else "No effects were given to try; the twin's own quantities differ from the data by no more than chance.",
         "Nothing to change in the twin.",
     )
+
+
+def _unjudged(report: Report) -> str:
+    """Which effects could not be judged, and why; of those that were named all the same nothing is said."""
+    named = set(report["causes"][0]["effects"]) if report["verdict"] in _NAMING else set[str]()
+    rows = [
+        row for row in report.get("screening", []) if row.get("absorbed_by") and row["effect"] not in named
+    ]
+    told = ""
+    for is_unseen in (False, True):
+        names = [words(row["effect"]) for row in rows if (row.get("absorbed_by") == UNSEEN) == is_unseen]
+        if names:
+            who = capital(listing(names)) if len(names) <= _SPELT else f"{len(names)} listed effects"
+            them = "it" if len(names) == 1 else "them"
+            unseen = f"nothing that was observed depends on {them}"
+            why = unseen if is_unseen else "fitted parameters of the twin take up the same change"
+            told += f" {who} could not be judged, because {why}."
+    return told
 
 
 def _tried(judged: int) -> str:
