@@ -57,7 +57,8 @@ class Parameter:
         is_place: whether it says where an effect acts, such as the edge of a region, and not how much: it does nothing as
             long as the effect's sizes are at their null, and its prior holds as it stands, however small the effect.
         tried: values of a place at which an effect of one size is looked for before it is fitted; its prior, a normal one,
-            is then centred at the best of them.
+            is then centred at the best of them. Without them it is looked for at its null or, where data tell nothing of
+            the effect there, at quantiles of its prior, which stays as it is.
         labels: what its entries are called in a report, one after another; their indices where none are given.
         meaning: how its size is told to people; by its name and unit where none is given.
     """

@@ -1,6 +1,5 @@
 """What is said where no gap was found: what was tried, what would have been seen, and what came near to one."""
 
-from dtprob.gap.vocabulary import UNSEEN
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Detectable, Report, Site
 from dtprob.report.names import LEVEL, listing, located_words, whereabouts
@@ -24,16 +23,8 @@ def nothing_found(report: Report) -> str:
             else "; the twin's own quantities differ from the data by no more than chance"
         )
         return f"No effects were given to try{rest}.{_doubt(near)}"
-    untold = [row for row in screened if row.get("absorbed_by")]
-    unseen = sum(row.get("absorbed_by") == UNSEEN for row in untold)
-    judged = len(screened) - len(untold)
-    beside = ""
-    if absorbed := len(untold) - unseen:
-        more = " more" * (judged > 0)
-        beside = f" {absorbed}{more} could not be judged, because fitted parameters of the twin take up the same change."
-    if unseen:
-        beside += f" {unseen} could not be judged, because nothing that was observed depends on them."
-    return f"{_tried(judged, near)}{_doubt(near)}{beside} {_seen(report['detectable'])}"
+    judged = sum(not row.get("absorbed_by") for row in screened)
+    return f"{_tried(judged, near)}{_doubt(near)} {_seen(report['detectable'])}"
 
 
 def _tried(judged: int, near: Site | None) -> str:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
+from dtprob.gap.vocabulary import UNSEEN
 from dtprob.report.advice import advice, worth_telling
 from dtprob.report.closest import beyond, closest, values_are_wrong
 from dtprob.report.json_schema import Cause, Report, is_quiet
@@ -29,6 +30,8 @@ from dtprob.report.units import percent
 
 _NAMING = ("LISTED", "LISTED_WITH_REMAINDER")
 """Verdicts that name a cause."""
+_SPELT = 3
+"""Effects that could not be judged up to which they are named, not counted."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +51,7 @@ def tell(report: Report) -> Story:
     headline = (
         _sentences(spoken(report["summary"], _codes(report))) if "summary" in report else story.headline
     )
-    return replace(story, headline=headline)
+    return replace(story, headline=headline, meaning=f"{story.meaning}{_unjudged(report)}")
 
 
 def _without_copies(story: Story, report: Report) -> Story:
@@ -94,6 +97,24 @@ def _no_gap(report: Report) -> Story:
         nothing_found(report),
         f"Nothing to change in the twin.{doubt}",
     )
+
+
+def _unjudged(report: Report) -> str:
+    """Which effects could not be judged, and why; of those that were named all the same nothing is said."""
+    named = set(report["causes"][0]["effects"]) if report["verdict"] in _NAMING else set[str]()
+    rows = [
+        row for row in report.get("screening", []) if row.get("absorbed_by") and row["effect"] not in named
+    ]
+    told = ""
+    for is_unseen in (False, True):
+        names = [words(row["effect"]) for row in rows if (row.get("absorbed_by") == UNSEEN) == is_unseen]
+        if names:
+            who = capital(listing(names)) if len(names) <= _SPELT else f"{len(names)} listed effects"
+            them = "it" if len(names) == 1 else "them"
+            unseen = f"nothing that was observed depends on {them}"
+            why = unseen if is_unseen else "fitted parameters of the twin take up the same change"
+            told += f" {who} could not be judged, because {why}."
+    return told
 
 
 def _tolerated(report: Report) -> Story:

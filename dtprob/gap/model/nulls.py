@@ -121,7 +121,7 @@ def _check_slope(effect: Effect, values: Mapping[str, jax.Array], context: Conte
         raise InputError(what, "a finite derivative at its null", "inf or nan", remedy)
     if any(slope.any() for slope in slopes):
         return
-    moved = {name: jnp.asarray(value) + 1.0 for name, value in effect.null().items()}
+    moved = {p.name: jnp.full(p.shape, p.null if p.is_place else p.null + 1.0) for p in effect.parameters}
     after = (rewritten(effect, site, values[site], moved, context) for site in effect.rewrites)
     acts = any(
         not np.array_equal(np.asarray(a), np.broadcast_to(values[s], np.shape(a)), equal_nan=True)

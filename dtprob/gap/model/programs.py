@@ -99,6 +99,10 @@ class Programs:
             found |= self._tangents[family](dict(values), {n: nulls[n] for n in names}, self._arrays)
         return found
 
+    def declared(self, name: str) -> Effect:
+        """A candidate as it was at first, whatever null it has been given since."""
+        return self._effects[name]
+
     def _nulls_of(self, effects: Sequence[Effect]) -> dict[str, Any]:
         return self._nulls | {e.name: null_vector(e) for e in effects if e.name in self._nulls}
 

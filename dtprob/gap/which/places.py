@@ -1,8 +1,8 @@
 """Effects that may act anywhere: where the scores of one are largest, and whether larger than chance lets them be.
 
-The score of an effect of one size is told at every place that it names (`Parameter.tried`) from the site gradients that the
-maps use too. The effect is then screened and fitted from its best place; that it was the best of many is paid for by the
-same maximum in every replicate.
+The score of an effect of one size is told at every place that it names (`Parameter.tried`), or at quantiles of its prior
+(see `dtprob.gap.which.offered`), from the site gradients that the maps use too. The effect is then screened and fitted from
+its best place; that it was the best of many is paid for by the same maximum in every replicate.
 """
 
 from __future__ import annotations
@@ -21,10 +21,11 @@ from scipy import stats
 from dtprob.effects.effect import Effect, Parameter
 from dtprob.gap.fitting.bootstrap import Replicates
 from dtprob.gap.fitting.fit import Fit
-from dtprob.gap.fitting.plausible import is_one_sided, nulls, places
+from dtprob.gap.fitting.plausible import is_one_sided, limits, nulls, places
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.tails import LOG_SMALLEST, any_of, effective_tests, family_wise, gamma_tail
 from dtprob.gap.which.directions import surroundings
+from dtprob.gap.which.offered import Values, may_be_anywhere, offered
 
 _MOST_PRODUCTS: Final = 5e10
 """Products of scores that are worth looking for the places of effects; beyond, places are left out."""
@@ -38,10 +39,12 @@ _PORTION: Final = 576
 
 
 class _Grid(NamedTuple):
-    """Places as flat parameters, and how far apart neighbours are."""
+    """Places as flat parameters, how far apart neighbours are, and between what finer looks stay where priors end."""
 
     points: Float[np.ndarray, "place parameter"]
     spacing: Float[np.ndarray, "place parameter"]
+    low: Float[np.ndarray, " parameter"]
+    high: Float[np.ndarray, " parameter"]
 
 
 @dataclass(frozen=True)
@@ -52,11 +55,13 @@ class Placed:
         p_value: of its score there, that it is the best of many places accounted for.
         replicate_p: the same of each replicate at its own best place.
         price: log of the effective number of places.
+        information: J of the size of a mean effect at a typical place, the median of those that are tried.
     """
 
     p_value: float
     replicate_p: Float[np.ndarray, " replicate"]
     price: float
+    information: float
 
 
 def place(problem: Problem, fitted: Fit, drawn: Replicates) -> tuple[Problem, Mapping[str, Placed]]:
@@ -67,17 +72,20 @@ def place(problem: Problem, fitted: Fit, drawn: Replicates) -> tuple[Problem, Ma
         fitted: the effects that it has stay where they are.
         drawn: site gradients of the data and of replicates at the fit.
     """
-    left = [e for e in problem.effects if e.name not in fitted.effects]
-    searched = [e for e in left if e.is_looked_for and not drawn.gradients.keys().isdisjoint(e.rewrites)]
-    if not searched:
+    left = [e for e in problem.effects if e.name not in fitted.effects and may_be_anywhere(e)]
+    left = [e for e in left if not drawn.gradients.keys().isdisjoint(e.rewrites)]
+    if not left:
         return problem, {}
     around = surroundings(problem, fitted.x).grown()
+    tried = offered(problem, left, around, drawn)
     found, moved = {}, {}
-    for effect in searched:
+    for effect in (e for e in left if e.name in tried):
         entries = sum(drawn.gradients[site].size for site in effect.rewrites if site in drawn.gradients)
-        grid = _grid(effect, int(_MOST_PRODUCTS / (entries * len(searched))))
+        grid = _grid(effect, tried[effect.name], int(_MOST_PRODUCTS / (entries * len(tried))))
         found[effect.name], best = _best(problem, effect, around, drawn, grid)
         moved[effect.name] = _at(effect, best)
+    if not found:
+        return problem, {}
     return problem.with_candidates([moved.get(e.name, e) for e in problem.effects]), found
 
 
@@ -93,25 +101,42 @@ def _best(
     one_sided = is_field or is_one_sided(effect)
     portion = min(_PORTION, len(ways) * len(grid.points))  # all looks are compiled once
 
-    def told(points: np.ndarray) -> np.ndarray:
-        """How many standard deviations (place, n) the scores are from 0."""
+    def scores_at(points: np.ndarray) -> np.ndarray:
+        """Scores (place, n)."""
         count = -(-len(points) // portion) * portion
         padded = points[np.arange(count) % len(points)].reshape(-1, portion, points.shape[1])
         scores = [
             problem.programs.place_scores(effect.name, around, drawn.gradients, part) for part in padded
         ]
-        all_scores = np.concatenate(scores)[: len(points)]
-        t = _quantiles(all_scores) if is_field else _standardised(all_scores)
+        return np.concatenate(scores)[: len(points)]
+
+    def told(scores: np.ndarray) -> np.ndarray:
+        """How many standard deviations (place, n) they are from 0."""
+        t = _quantiles(scores) if is_field else _standardised(scores)
         return t if one_sided else np.abs(t)
 
-    t = told(grid.points)
-    best, highest = _finer(grid, t[:, 0], ways, lambda points: told(points)[:, 0], _FINER[effect.kind])
-    largest = np.array([highest, *t[:, 1:].max(axis=0)])
-    p, replicate_p = np.split(_tail(largest, len(largest) - 2, one_sided=one_sided), [1])
-    # What is looked at more finely in the data alone could have been in as many more places.
-    several = effective_tests(replicate_p) * len(ways)
+    scores = scores_at(grid.points)
+    t = told(scores)
+    best, looks = _finer(grid, t, ways, lambda points: told(scores_at(points)), _FINER[effect.kind])
+    freedom = looks.shape[1] - 2
+    p = _tail(looks[-1, :1], freedom, one_sided=one_sided)
+    replicate_p = _tail(looks[:2, 1:], freedom, one_sided=one_sided)
+    several = _several(replicate_p, len(ways), everywhere=len(grid.points) <= _FINER[effect.kind][0])
+    information = float(np.median(np.mean(scores[:, 1:] ** 2, axis=1)))
     chance = float(any_of(p, several)[0])
-    return Placed(chance, family_wise(replicate_p, replicate_p), float(np.log(several))), best
+    return Placed(
+        chance, family_wise(replicate_p[-1], replicate_p[-1]), float(np.log(several)), information
+    ), best
+
+
+def _several(replicate_p: Float[np.ndarray, "look replicate"], ways: int, *, everywhere: bool) -> float:
+    """Effective number of places that the data were looked for at.
+
+    What is looked at more finely in the data alone could have been in as many more places. Where the first finer look was
+    around all places, and so at those of the replicates too, they tell how many these are; the second adds no more.
+    """
+    coarse, fine = (effective_tests(p) for p in replicate_p)
+    return min(fine**2 / coarse, coarse * ways) if everywhere else coarse * ways
 
 
 def _ways(grid: _Grid) -> np.ndarray:
@@ -122,33 +147,41 @@ def _ways(grid: _Grid) -> np.ndarray:
 
 def _finer(
     grid: _Grid,
-    scores: np.ndarray,
+    scores: Float[np.ndarray, "place n"],
     ways: np.ndarray,
     told: Callable[[np.ndarray], np.ndarray],
     counts: Sequence[int],
-) -> tuple[np.ndarray, float]:
-    """The best place and its score, after finer and finer looks around those with the largest scores of the grid."""
-    (points, spacing), highest = grid, float(scores.max())
-    best = points[int(scores.argmax())]
+) -> tuple[np.ndarray, Float[np.ndarray, "look n"]]:
+    """The best place of the data, after finer and finer looks around those with their largest scores of the grid.
+
+    Besides the largest scores up to each look, of the data and of the replicates at the same places.
+    """
+    points, spacing = grid.points, grid.spacing
+    best, looks = points[int(scores[:, 0].argmax())], [scores.max(axis=0)]
     for kept in counts:
-        chosen = np.argsort(-scores)[:kept]
+        chosen = np.argsort(-scores[:, 0])[:kept]
         spacing = spacing[chosen] / 3
         points = (points[chosen][:, None] + ways * spacing[:, None]).reshape(-1, points.shape[1])
+        points = np.clip(points, grid.low, grid.high)
         spacing, scores = np.repeat(spacing, len(ways), axis=0), told(points)
-        if scores.max() > highest:
-            best, highest = points[int(scores.argmax())], float(scores.max())
-    return best, highest
+        if scores[:, 0].max() > looks[-1][0]:
+            best = points[int(scores[:, 0].argmax())]
+        looks.append(np.maximum(looks[-1], scores.max(axis=0)))
+    return best, np.stack(looks)
 
 
-def _grid(effect: Effect, most: int) -> _Grid:
+def _grid(effect: Effect, tried: Values, most: int) -> _Grid:
     """Combinations (place, parameter) of the places that are tried, the size at its null, and how far apart they are."""
-    values = [np.array(p.tried or (p.null,)) for p in effect.parameters for _ in range(p.size)]
+    values = [v for v, p in zip(tried, effect.parameters, strict=True) for _ in range(p.size)]
     gaps = [np.gradient(v) if len(v) > 1 else np.zeros(1) for v in values]
     points, spacing = (
         np.stack(np.meshgrid(*v, indexing="ij"), -1).reshape(-1, len(v)) for v in (values, gaps)
     )
     kept = np.linspace(0, len(points) - 1, min(max(most, 1), len(points))).round().astype(int)
-    return _Grid(points[kept], spacing[kept])
+    low, high = limits(effect)
+    low = np.where(np.isfinite(low), points.min(axis=0), -np.inf)
+    high = np.where(np.isfinite(high), points.max(axis=0), np.inf)
+    return _Grid(points[kept], spacing[kept], low, high)
 
 
 @np.errstate(invalid="ignore")  # a place where the model is not finite tells nothing
@@ -193,8 +226,9 @@ def _at(effect: Effect, point: Float[np.ndarray, " parameter"]) -> Effect:
 
 
 def _moved(parameter: Parameter, entries: Float[np.ndarray, " entry"]) -> Parameter:
-    """The parameter at its best place; one that is not tried has no better place than it had."""
-    if not parameter.tried:
+    """The parameter at its best place: about that it is where places are named, else its prior stands."""
+    if not parameter.is_place or parameter.shape:
         return parameter
     to = float(entries[0])
-    return replace(parameter, prior=dist.Normal(to, float(parameter.scale)), null=to)
+    prior = dist.Normal(to, float(parameter.scale)) if parameter.tried else parameter.prior
+    return replace(parameter, prior=prior, null=to)

@@ -18,7 +18,7 @@ from dtprob.effects.effect import Effect
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.active import activate
 from dtprob.gap.fitting.bootstrap import Replicates, more
-from dtprob.gap.fitting.plausible import is_one_sided, scales, sizes
+from dtprob.gap.fitting.plausible import is_one_sided, places, scales, sizes
 from dtprob.gap.fitting.projection import Projection
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.settings import Settings
@@ -153,7 +153,7 @@ def screen(
         absorbed_by=tuple(_absorbed(problem, fitted, scores, reach, c) for c in candidates),
         opposite=tuple(c.name in opposite for c in candidates),
         beyond=tuple(beyond.get(c.name) for c in candidates),
-        detectable=tuple(_detectable(scores, c, settings) for c in candidates),
+        detectable=tuple(_detectable(scores, c, placed.get(c.name), settings) for c in candidates),
         correlation=_correlation(candidates, scores),
         locates=tuple(c.name in scores.locating for c in candidates),
         scores=scores,
@@ -217,14 +217,22 @@ def _absorbed(
     return blocks[int(owners[int(np.argmax(share))])].name
 
 
-def _detectable(scores: Scores, effect: Effect, settings: Settings) -> Detectable | None:
-    """From which size on a candidate would be noticed, if it moves an expectation or has another size to tell of."""
+def _detectable(
+    scores: Scores, effect: Effect, found: Placed | None, settings: Settings
+) -> Detectable | None:
+    """From which size on a candidate would be noticed, if it moves an expectation or has another size to tell of.
+
+    Of one that may act anywhere at a typical place: at its best one, to which chance has led, that may be another size.
+    """
     if effect.kind != "mean":
         return None
     k = [e.name for e in scores.effects].index(effect.name)
     own, total = np.diag(scores.part(k)), scores.total[scores.groups[k]]
+    own = np.where(own > NOTHING * total, own, 0.0)
+    if found is not None:
+        own = np.where(places(effect), own, found.information)
     level = settings.level / (2 * max(len(scores.effects), 1) * float(np.exp(scores.price[k])))
-    return detectable(effect, np.where(own > NOTHING * total, own, 0.0), scores.root(k).shape[1], level)
+    return detectable(effect, own, scores.root(k).shape[1], level)
 
 
 def _correlation(candidates: list[Effect], scores: Scores) -> np.ndarray:

@@ -128,3 +128,17 @@ def test_effects_on_indices_are_refused():
 def test_two_effects_of_one_name_are_refused():
     with pytest.raises(InputError, match="effects: expected one of each name, got several named 'bend'"):
         Problem(line, draw("line"), [bend(), bend()])
+
+
+def test_an_effect_that_acts_nowhere_at_its_usual_place_is_not_refused():
+    """One unit from there it does: it is looked for at other places."""
+    start = float(draw("line")["x"].min())
+    before = Effect(
+        "before",
+        {"mean": lambda v, p, c: v + p["c"] * jnp.maximum(p["edge"] - c["x"], 0.0)},
+        (
+            Parameter("c", dist.Normal()),
+            Parameter("edge", dist.Normal(start, 1.0), null=start - 0.5, is_place=True),
+        ),
+    )
+    check_nulls(Problem(line, draw("line"), [before]))

@@ -27,7 +27,7 @@ from dtprob.gap.which.screen import screen
 from dtprob.gap.which.search import search
 from dtprob.gap.which.trials import tried
 from dtprob.inference.laplace import Laplace
-from tests.unit.gap.examples import PLACES, WIDTH, bump, draw, gusty, inputs, line, raised, ripple
+from tests.unit.gap.examples import PLACES, WIDTH, bump, draw, gusty, inputs, line, raised, ripple, use
 
 FAST = replace(Settings(), replicates=99)
 
@@ -228,6 +228,76 @@ def test_what_is_not_there_has_a_negative_score(looked):
     np.testing.assert_allclose(
         alone.log_bayes_factor - seen.scores.log_bayes_factor, found["bump"].price, rtol=1e-9
     )
+
+
+DAYS = np.repeat(np.arange(8.0), 40)
+
+
+def steps_on(true, size, seed=0):
+    """Readings on eight days, a step since any of them being looked for: problem, base fit, projection, replicates."""
+
+    def level(day, y=None):
+        mean_level = numpyro.sample("level", dist.Normal(0.0, 10.0))
+        with numpyro.plate("row", len(day)):
+            mean = numpyro.deterministic("mean", mean_level + 0.0 * day)
+            numpyro.sample("y", dist.Normal(mean, 1.0), obs=y)
+
+    since = Effect(
+        "since",
+        {"mean": lambda value, p, context: value + p["db"] * (context["day"] >= p["day"])},
+        (
+            Parameter("db", dist.Normal(0.0, 2.0)),
+            Parameter(
+                "day", dist.Normal(4.0, 2.0), null=4.0, is_place=True, tried=tuple(np.arange(1.0, 8.0))
+            ),
+        ),
+    )
+    y = size * (true <= DAYS) + np.random.default_rng(seed).normal(size=len(DAYS))
+    problem = Problem(level, {"day": jnp.asarray(DAYS), "y": jnp.asarray(y)}, [since])
+    base = fitting.fit(problem, problem.null())
+    projection = project(problem, base)
+    return problem, base, projection, replicate(problem, base, projection, jax.random.key(seed), FAST)
+
+
+def test_what_would_be_noticed_is_told_of_a_typical_place():
+    """A step on the last day needs 1.5 times the size of one in the middle; data may lead to either."""
+    told = []
+    for true in (4.0, 7.0):
+        problem, base, projection, drawn = steps_on(true, 2.0)
+        moved, found = place(problem, base, drawn)
+        assert moved.effects[0].parameters[1].null == pytest.approx(true, abs=1.0)
+        (one,) = screen(moved, base, projection, drawn, Settings(), placed=found).detectable
+        told.append(one.size / np.sqrt(_needed(found["since"].price)))
+    share = np.arange(1, 8) / 8
+    expected = 1 / np.sqrt(len(DAYS) * np.median(share * (1 - share)))
+    np.testing.assert_allclose(told, expected, rtol=0.2)  # 99 replicates tell a deviation to 7%
+
+
+def _needed(price):
+    """Information times the square of a size that is noticed nine times in ten."""
+    return (stats.norm.isf(Settings().level / 4 / np.exp(price)) + stats.norm.ppf(0.9)) ** 2
+
+
+def test_finer_looks_that_find_nothing_new_cost_nothing():
+    """There are seven steps, each of which is tried."""
+    problem, base, _, drawn = steps_on(4.0, 0.0)
+    assert 1 < np.exp(place(problem, base, drawn)[1]["since"].price) <= 7
+
+
+@pytest.mark.study
+def test_the_best_of_many_places_is_as_rare_as_its_p_value_says():
+    """Of 200 right twins, none too many below each level and none too few, by exact binomial bounds at 1e-3."""
+    at = Parameter("at", dist.Normal(0.0, 1.2), is_place=True, tried=tuple(np.linspace(-2.0, 2.0, 61)))
+    close = replace(bump(), parameters=(bump().parameters[0], at))
+    problem, values = Problem(line, draw("line"), [close]), []
+    for seed in range(1, 201):
+        problem = use(problem, draw("line", seed=seed))
+        base = fitting.fit(problem, problem.null())
+        drawn = replicate(problem, base, project(problem, base), jax.random.key(seed), FAST)
+        values.append(place(problem, base, drawn)[1]["bump"].p_value)
+    for level in (0.01, 0.05, 0.2):
+        assert (np.array(values) < level).sum() <= stats.binom.isf(1e-3, len(values), level)
+    assert (np.array(values) < 0.2).sum() >= stats.binom.ppf(1e-3, len(values), 0.2)
 
 
 @pytest.mark.parametrize(
