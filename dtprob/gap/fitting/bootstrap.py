@@ -67,6 +67,20 @@ class Replicates:
         """Gradients (n, *site) by site of projected rows (n, cluster, row)."""
         return _site_gradients(self.problem, self.fitted, self.projection, rows)
 
+    def of_rows(self, rows: np.ndarray) -> Replicates:
+        """The same with other projected rows (1 + replicate, cluster, row), and their site gradients."""
+        parts = [
+            self.site_gradients(np.concatenate([rows[:1], rows[low : low + self.together]]))
+            for low in range(1, len(rows), self.together)  # of the shape that is compiled
+        ]
+        gradients = {
+            n: jnp.asarray(
+                np.concatenate([np.asarray(parts[0][n])[:1], *(np.asarray(part[n])[1:] for part in parts)])
+            )
+            for n in self.gradients
+        }
+        return replace(self, rows=rows, gradients=gradients)
+
     def portions(self) -> Iterator[tuple[np.ndarray, Mapping[str, jax.Array]]]:
         """All replicates: whitened rows (replicate, cluster, row), not projected, and observed values by site."""
         return _portions(self.problem, self.fitted, self.projection, self.keys)
@@ -122,16 +136,7 @@ def more(drawn: Replicates, times: int) -> Replicates:
     first = drawn.at_sites
     keys = jax.random.split(key_for(drawn.key, f"{times} more"), times * first)
     projected = _projected(drawn.problem, drawn.fitted, drawn.projection, keys)
-    observed = drawn.rows[:1]
-    parts = [
-        drawn.site_gradients(np.concatenate([observed, projected[low : low + first]]))
-        for low in range(0, len(projected), first)  # of the shape that is compiled
-    ]
-    gradients = {
-        n: jnp.asarray(np.concatenate([np.asarray(g)[:1], *(np.asarray(part[n])[1:] for part in parts)]))
-        for n, g in drawn.gradients.items()
-    }
-    return replace(drawn, rows=np.concatenate([observed, projected]), gradients=gradients, together=first)
+    return replace(drawn, together=first).of_rows(np.concatenate([drawn.rows[:1], projected]))
 
 
 def normal_like(drawn: Replicates) -> tuple[np.ndarray, dict[str, np.ndarray]]:

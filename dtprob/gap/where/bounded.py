@@ -22,6 +22,9 @@ _FAR_TAIL: Final = 2.5
 """Standard deviations at which a normal row is held: of a fourth power sooner, whose sums are skew themselves."""
 _FAR_POWER: Final = 5.0
 """Mean powers at which that of a complex row is held."""
+_FARTHEST: Final = 6.0
+_FARTHEST_POWER: Final = 18.0
+"""The same where a few rows that lie far out are looked for among many."""
 _NODES: Final = 200_001
 """Of quadrature over what has corners where it is held."""
 
@@ -57,8 +60,10 @@ def _normal(x: np.ndarray) -> np.ndarray:
 
 _SKEWNESS: Final = _held(Polynomial([0, -3, 0, 1]), Polynomial([0, 1]), _FAR_SKEW, _normal, -40.0)
 _TAILS: Final = _held(Polynomial([3, 0, -6, 0, 1]), Polynomial([-1, 0, 1]), _FAR_TAIL, _normal, -40.0)
-_POWER_TAILS: Final = _held(
-    Polynomial([1, -2, 0.5]), Polynomial([1, -1]), _FAR_POWER, lambda x: np.exp(-x), 0.0
+_FEW: Final = _held(Polynomial([3, 0, -6, 0, 1]), Polynomial([-1, 0, 1]), _FARTHEST, _normal, -40.0)
+_POWER_TAILS, _FEW_POWERS = (
+    _held(Polynomial([1, -2, 0.5]), Polynomial([1, -1]), far, lambda x: np.exp(-x), 0.0)
+    for far in (_FAR_POWER, _FARTHEST_POWER)
 )
 
 
@@ -70,6 +75,11 @@ def skewness(row: np.ndarray) -> np.ndarray:
 def tails(row: np.ndarray) -> np.ndarray:
     """Of a normal row, positive on average where its tails are heavy; no scale moves it."""
     return _TAILS(row)
+
+
+def few(row: np.ndarray) -> np.ndarray:
+    """As `tails`, or `complex_tails`, but held so far out that a few of many rows count."""
+    return _FEW_POWERS(np.abs(row) ** 2 / 2.0) if np.iscomplexobj(row) else _FEW(row)
 
 
 def beside(values: np.ndarray, rows: np.ndarray) -> np.ndarray:

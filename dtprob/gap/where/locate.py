@@ -29,6 +29,7 @@ from dtprob.gap.where.data_columns import all_columns, whole_columns
 from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
+from dtprob.gap.where.far_readings import far_readings, held, naming
 from dtprob.gap.where.foremost import foremost
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.in_all import InAll
@@ -95,10 +96,15 @@ def locate(
     """
     blocks, maps = scan_coordinates(problem, drawn)
     ways = _ways(problem, projection.origin, drawn)  # what was fitted to these data would agree with them
-    seen = _test_sites(problem, fitted, projection, drawn, ways)
+    looked = drawn
+    seen = _test_sites(problem, fitted, projection, looked, ways)
     for times, (low, high) in _further_looks(drawn, settings, shown=shown, discrete=ways.normal is not None):
         if low < seen.p_value < high:
-            seen = _test_sites(problem, fitted, projection, more(drawn, times), ways)
+            looked = more(drawn, times)
+            seen = _test_sites(problem, fitted, projection, looked, ways)
+    if far := far_readings(looked, seen.of_moments):
+        seen = _test_sites(problem, fitted, projection, looked, ways, at_sites=held(looked, far))
+        seen = seen._replace(of_moments=naming(seen.of_moments, far))
     sure = {f.site for f in seen.of_sites if f.p_value <= SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
     suspected = tuple(sorted(named, key=lambda s: -s.steady))
@@ -182,10 +188,18 @@ def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
 
 
 def _test_sites(
-    problem: Problem, fitted: Fit, projection: Projection, drawn: Replicates, ways: _Ways
+    problem: Problem,
+    fitted: Fit,
+    projection: Projection,
+    drawn: Replicates,
+    ways: _Ways,
+    *,
+    at_sites: Replicates | None = None,
 ) -> _Tested:
+    """Every family of every site, and further moments; sites with far readings held where `at_sites` has these."""
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
-    rows, gradients = drawn.rows, {n: np.asarray(g) for n, g in drawn.gradients.items()}
+    told = drawn if at_sites is None else at_sites
+    rows, gradients = told.rows, {n: np.asarray(g) for n, g in told.gradients.items()}
     if ways.normal is not None:
         rows = np.concatenate([rows, ways.normal[0]])
         gradients = {n: np.concatenate([g, ways.normal[1][n]]) for n, g in gradients.items()}

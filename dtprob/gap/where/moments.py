@@ -6,6 +6,8 @@ tests with fitted parameters: Thomas and Pierce, JASA 74 (1979)), pooled over en
 among many. What has no spread of its own, counts and waits, may be spread less than its mean says. Complex rows have a
 product with the conjugate, and their square where noise is not circular (Picinbono, IEEE Trans. Signal Process. 42 (1994)).
 All are bounded: one far row of a right twin must not look like more. What each is of a right twin, replicates tell.
+Tails of what is normal are looked at twice, since a few readings that lie far out are hardly seen among many if they count
+for no more than 2.5 standard deviations: held at six, all but the farthest one.
 """
 
 from __future__ import annotations
@@ -22,7 +24,7 @@ from scipy.special import ndtri
 from dtprob.gap.model.problem import Problem
 from dtprob.gap.observation.likelihoods import Likelihood, likelihood
 from dtprob.gap.observation.residuals import Parameters
-from dtprob.gap.where.bounded import beside, complex_tails, dispersion, scored, skewness, tails
+from dtprob.gap.where.bounded import beside, complex_tails, dispersion, few, scored, skewness, tails
 from dtprob.gap.where.families import Family, Pattern
 
 _MOST: Final = 1 << 16
@@ -31,6 +33,8 @@ _HEAVIEST: Final = 4.0
 """Kurtosis over replicates up to which a sum of products of outcomes is looked at; 3 of a normal one."""
 _TOLD: Final = 3.3
 """The same, told by the rows' own kurtosis and the number of products."""
+_FEW: Final = "few"
+"""Label of the tails that a few readings make, wherever they are."""
 _LEAST: Final = 1e-12
 """Probabilities are kept so far from zero and one."""
 _OF_FAR_ONES: Final = ("skewness", "tails", "dispersion")
@@ -90,6 +94,8 @@ def further_moments(
                 if not known.is_outcome or _is_near_normal(scores[1:]):
                     pattern = Pattern(axes[kept[0]] if kept else "common", kept)
                     yield name, Family(kind, pattern, np.ones(())), scores
+        if known.log_scale is not None and row[0, 0].size >= _POOLED:
+            yield name, Family("tails", Pattern(_FEW, ()), np.ones(())), _but_farthest(few(row[:, 0]))
         for kind, scores in _delayed(products[name], axes, is_outcome=known.is_outcome):
             yield name, Family(kind, Pattern("each", ()), np.ones(())), scores
 
@@ -105,6 +111,15 @@ def _pooled(values: np.ndarray, kept: tuple[int, ...]) -> np.ndarray:
     centred = values - values[1:].mean(axis=0)
     rest = tuple(1 + i for i in range(values.ndim - 1) if i not in kept)
     return np.ascontiguousarray(centred.sum(rest).reshape(len(values), -1)).view(float)
+
+
+def _but_farthest(values: np.ndarray) -> np.ndarray:
+    """Sums (n, 1) of values (n, *entry) but the largest of each, less what replicates have: one far reading is no tail."""
+    each = values.reshape(len(values), -1)
+    summed = each.sum(axis=1) - each.max(axis=1)
+    scores = (summed - summed[1:].mean())[:, None]
+    scores[0] = np.maximum(scores[0], 0.0)  # tails that are too light are none of a few readings
+    return scores
 
 
 def _is_near_normal(scores: np.ndarray) -> bool:

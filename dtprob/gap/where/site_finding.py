@@ -42,6 +42,7 @@ class SiteFinding:
         whereabouts: the pattern, where it says where or along what something is wrong.
         is_ripple: whether it varies in ripples, which find any reading that is far off.
         is_of_each: whether it varies from reading to reading, which finds them, too.
+        is_held: of far readings, whether sites were tested with these held, so that what is wrong there is not they.
     """
 
     site: str
@@ -57,6 +58,7 @@ class SiteFinding:
     whereabouts: str | None = None
     is_ripple: bool = False
     is_of_each: bool = False
+    is_held: bool = False
 
     @property
     def family(self) -> str:
@@ -72,6 +74,21 @@ class SiteFinding:
     def is_of_values(self) -> bool:
         """Whether values are wrong, and not how observations spread about them, by whatever name."""
         return self.moment is None and not self.spreads
+
+    @property
+    def is_of_far(self) -> bool:
+        """Whether it is of readings that lie far out, to both sides or to one."""
+        return self.moment in ("tails", "skewness")
+
+    @property
+    def strays(self) -> bool:
+        """Whether far readings are surely what is wrong."""
+        return self.is_of_far and self.p_value <= _FAR_READINGS
+
+    @property
+    def is_placed(self) -> bool:
+        """Whether it is of a site, or of how an observation spreads, which differ from place to place."""
+        return self.moment in (None, "spread", "shape")
 
     @property
     def is_inline(self) -> bool:
@@ -125,16 +142,23 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
     Ripples of a spread, and what varies from reading to reading, come last where tails or skewness are what is wrong: they
     find any reading that is far off.
 
+    Far readings that sites were tested without come last where one of these is surely wrong: where many readings are off at
+    one place, they lie far out among all.
+
     Readings themselves come last where a site stands for some of them, unless they are more than twice as surely wrong.
 
     Where p-values end values come last if their scores are no larger than noise of such an energy (of the residuals, over
     its expectation) makes them.
     """
-    strays = any(f.moment in ("tails", "skewness") and f.p_value <= _FAR_READINGS for f in findings)
+    strays = any(f.strays for f in findings)
+    by_strays = [strays and ((f.is_ripple and not f.is_of_values) or f.is_of_each) for f in findings]
+    at_places = (f.p_value for f, by in zip(findings, by_strays, strict=True) if f.is_placed and not by)
+    is_at_a_place = min(at_places, default=1.0) <= SURE
     steady = [f for f in findings if f.is_of_values and not (strays and f.is_of_each)]
     of_values = min((f.p_value for f in steady), default=1.0)
     explained = max((f.beyond_noise for f in steady), default=0.0)
-    moments = (f for f in findings if not f.is_of_values and (f.gain is None or f.gain > explained))
+    others = (f for f in findings if not (f.is_of_values or f.is_held))
+    moments = (f for f in others if (f.gain is None or f.gain > explained))
     of_moments = min((f.p_value for f in moments), default=1.0)
     score = max((f.score for f in steady), default=0.0)
     by_noise = of_moments < of_values**2 or (of_moments < _END and score < _LIKE_NOISE * energy)
@@ -143,10 +167,11 @@ def shadows_last(findings: Sequence[SiteFinding], energy: float) -> list[SiteFin
         replace(
             f,
             last=(of_values <= SURE and f.is_of_values == by_noise and not f.repeats)
-            or (strays and ((f.is_ripple and not f.is_of_values) or f.is_of_each))
+            or by
+            or (f.is_held and is_at_a_place)
             or (f.is_inline and of_sites <= SURE and f.p_value >= of_sites**2),
         )
-        for f in findings
+        for f, by in zip(findings, by_strays, strict=True)
     ]
 
 

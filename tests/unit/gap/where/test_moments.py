@@ -143,7 +143,7 @@ def test_nothing_is_noticed_where_nothing_is_wrong():
         tests = [
             family_test(family, scores) for _, family, scores in further_moments(problem, fitted.x, stacked)
         ]
-        assert len(tests) == 2 * (6 * 4 + 2 * 4) + 4
+        assert len(tests) == 2 * (6 * 4 + 2 * 4 + 1) + 4
         smallest = np.stack([test.null for test in tests], axis=1).min(axis=1)
         found.append(family_wise(np.array([min(test.p_value for test in tests)]), smallest)[0])
     for level in (0.01, 0.1):
