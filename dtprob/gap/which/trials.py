@@ -49,6 +49,8 @@ _POLISHED_LATER: Final = 1
 """New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
 """Nats above which first-order scores may miss the effect that matters."""
+_HIDING_GAP: Final = 30.0
+"""The same where clusters have own unknowns that are best elsewhere, which a fit without the effect has bent to hide it."""
 _AT_FIT: Final = 1
 """Which of the scans is that of whole sizes at the fit. What gains there is no move of a nuisance, which the fit would have
 made."""
@@ -115,7 +117,7 @@ def tried(
     """
     screening, fitted = seen.screening, seen.fitted
     scans: list[dict[str, Found]] = []
-    if not fitted.effects and seen.promise > _LARGE_GAP:
+    if not fitted.effects and seen.promise > _HIDING_GAP:
         say("scanning the effects' plausible sizes")
         scans = _scans(seen)
     chosen = [n for n in dict.fromkeys([*_chosen(seen, scans, settings, banned), *earlier]) if n not in known]
@@ -139,14 +141,14 @@ def tried(
 
 
 def _scans(seen: View) -> list[dict[str, Found]]:
-    """What far looks find where scores may miss it."""
+    """What far looks find where scores may miss it; where the gap is not large, those at clusters' own unknowns anew."""
     problem, x, names = seen.problem, seen.fitted.x, seen.screening.names
-    middle = centre(problem, x)
+    middle, is_large = centre(problem, x), seen.promise > _LARGE_GAP
     return [
-        scan(problem, x, names, middle),
+        scan(problem, x, names, middle) if is_large else {},
         scan_anew(problem, x, names),
         scan_anew(problem, middle, names),
-        scan_each(problem, x, names, middle),
+        scan_each(problem, x, names, middle) if is_large else {},
     ]
 
 
@@ -238,7 +240,7 @@ def _chosen(
         and _affordable(seen.problem, name)
     ]
     by_score = _by_gain(able, screening.log_bayes_factor)
-    if seen.promise <= _LARGE_GAP:
+    if seen.promise <= _LARGE_GAP and not any(scans):
         return [screening.names[i] for i in by_score[: settings.candidates]]
     ranked = []
     for found in scans:

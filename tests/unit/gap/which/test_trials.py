@@ -5,6 +5,7 @@ from typing import Any, cast
 
 import numpy as np
 import numpyro.distributions as dist
+import pytest
 
 from dtprob.effects import Effect, Parameter
 from dtprob.gap.settings import Settings
@@ -57,6 +58,20 @@ def test_a_small_gap_is_judged_by_scores_alone():
     scores = {"near": 90.0, "far": 80.0, "swap": 70.0, "tilt": 8.0, "drift": 6.0}
     found = chosen(scores, [], 5, noise=("near", "far", "swap"), promise=90.0)
     assert found == ["near", "far", "swap", "tilt", "drift"]
+
+
+def test_what_a_smaller_gap_hides_is_looked_for_with_clusters_own_unknowns_found_anew(monkeypatch):
+    """An exchange of two anchors 263 nats better, of which neither its score nor the gap's promise of 79 told."""
+    far = {"swap": 263.0, "drift": 2.0}
+    assert chosen({"near": 24.0, "far": 10.0}, [{}, {}, far, {}], 2, promise=79.0) == ["near", "swap"]
+    found = {"swap": Found(263.0, np.zeros(0), np.ones(1))}
+    for name in ("scan", "scan_each"):
+        monkeypatch.setattr(trials, name, lambda *_: pytest.fail("for large gaps only"))
+    monkeypatch.setattr(trials, "centre", lambda _problem, x: x)
+    monkeypatch.setattr(trials, "scan_anew", lambda *_: found)
+    place = SimpleNamespace(x=np.zeros(0))
+    seen = SimpleNamespace(problem=None, fitted=place, screening=SimpleNamespace(names=NAMES), promise=79.0)
+    assert trials._scans(cast("Any", seen)) == [{}, found, found, {}]
 
 
 def test_what_gains_nothing_or_is_absorbed_is_not_refitted():
