@@ -6,38 +6,31 @@ all families of all sites.
 
 from __future__ import annotations
 
-import functools
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
 
-from dtprob.gap.fitting.bootstrap import Replicates, more, normal_like
+from dtprob.gap.fitting.bootstrap import Replicates, more
 from dtprob.gap.fitting.fit import Fit
 from dtprob.gap.fitting.projection import Projection
-from dtprob.gap.model.conditioned import conditioned
-from dtprob.gap.model.inline import unnamed
 from dtprob.gap.model.problem import Problem
-from dtprob.gap.observation.likelihoods import is_discrete
 from dtprob.gap.settings import Settings
-from dtprob.gap.where.along import curves
 from dtprob.gap.where.coordinates import CoordinateFinding, scan_coordinates
-from dtprob.gap.where.data_columns import all_columns, whole_columns
 from dtprob.gap.where.differences import Differences, differences
-from dtprob.gap.where.families import Along, Family, Over, Site, deterministic, families, observed, shifted
+from dtprob.gap.where.families import Family, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.far_readings import far_readings, held, naming
 from dtprob.gap.where.foremost import foremost
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.in_all import InAll
 from dtprob.gap.where.moments import further_moments
-from dtprob.gap.where.quantities import Quantity, cells, groups, of_each, quantity, together
-from dtprob.gap.where.repeats import repeats
 from dtprob.gap.where.site_finding import SURE, SiteFinding, rank, shadows_last
 from dtprob.gap.where.suspects import Suspect, plainest, suspects
+from dtprob.gap.where.ways import Ways, ways
 
 _ALL_SPREAD: Final = 0.999
 """Share of what a site moves that lies in spreads where it moves nothing else."""
@@ -95,15 +88,17 @@ def locate(
         shown: whether the effects' scores show a gap already.
     """
     blocks, maps = scan_coordinates(problem, drawn)
-    ways = _ways(problem, projection.origin, drawn)  # what was fitted to these data would agree with them
-    looked = drawn
-    seen = _test_sites(problem, fitted, projection, looked, ways)
-    for times, (low, high) in _further_looks(drawn, settings, shown=shown, discrete=ways.normal is not None):
+    # at the origin: what was fitted to these data would agree with them
+    looked_for, looked = ways(problem, projection.origin, drawn), drawn
+    seen = _test_sites(problem, fitted, projection, looked, looked_for)
+    for times, (low, high) in _further_looks(
+        drawn, settings, shown=shown, discrete=looked_for.normal is not None
+    ):
         if low < seen.p_value < high:
             looked = more(drawn, times)
-            seen = _test_sites(problem, fitted, projection, looked, ways)
+            seen = _test_sites(problem, fitted, projection, looked, looked_for)
     if far := far_readings(looked, seen.of_moments):
-        seen = _test_sites(problem, fitted, projection, looked, ways, at_sites=held(looked, far))
+        seen = _test_sites(problem, fitted, projection, looked, looked_for, at_sites=held(looked, far))
         seen = seen._replace(of_moments=naming(seen.of_moments, far))
     sure = {f.site for f in seen.of_sites if f.p_value <= SURE}
     named = [s for site, tests in seen.tested if site.name in sure for s in suspects(site, tests)]
@@ -148,51 +143,12 @@ class _Tested(NamedTuple):
         return min((f.p_value for f in self.findings), default=1.0)
 
 
-class _Ways(NamedTuple):
-    """How sites may be wrong, whatever the replicates.
-
-    Attributes:
-        values: of the sites.
-        along: curves along their axes.
-        over: curves over quantities.
-        unnamed: observations whose values no site stands for.
-        normal: normal rows and site gradients, of the replicates' covariance, of outcomes and counts; else None.
-        repeated: observations of which one value is read too often.
-    """
-
-    values: Mapping[str, np.ndarray]
-    along: Along
-    over: Over
-    unnamed: frozenset[str]
-    normal: tuple[np.ndarray, Mapping[str, np.ndarray]] | None
-    repeated: Sequence[SiteFinding]
-
-
-def _ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> _Ways:
-    at = problem.compiled.sites(x)
-    values = {n: np.broadcast_to(np.asarray(at[n]), grown.shape) for n, grown in problem.float_sites.items()}
-    along = functools.cache(functools.partial(curves, problem))  # sites share their axes
-    knowing = conditioned(problem, x)
-    apart = {n: value for n, value in values.items() if n not in knowing}
-    over = [(q, tuple(q.curves())) for q in _quantities(problem, apart)]
-    over += [
-        (q, (found,))
-        for axes, shape, given in _observed(problem)
-        for q, found in together(axes, shape, given)
-    ]
-    each = _columns(problem)
-    over += [(q, (found,)) for n, (axes, value) in each.items() for q, found in of_each(n, axes, value)]
-    discrete = any(is_discrete(family) for family in problem.families.values())
-    normal = normal_like(drawn) if discrete else None
-    return _Ways(values, along, over, unnamed(problem, x), normal, tuple(repeats(problem, x)))
-
-
 def _test_sites(
     problem: Problem,
     fitted: Fit,
     projection: Projection,
     drawn: Replicates,
-    ways: _Ways,
+    looked_for: Ways,
     *,
     at_sites: Replicates | None = None,
 ) -> _Tested:
@@ -200,17 +156,20 @@ def _test_sites(
     axes = {name: site.axes for name, site in problem.declaration.sites.items()}
     told = drawn if at_sites is None else at_sites
     rows, gradients = told.rows, {n: np.asarray(g) for n, g in told.gradients.items()}
-    if ways.normal is not None:
-        rows = np.concatenate([rows, ways.normal[0]])
-        gradients = {n: np.concatenate([g, ways.normal[1][n]]) for n, g in gradients.items()}
-    found = [deterministic(n, axes[n], ways.values[n], g) for n, g in gradients.items()]
-    found += observed(problem, rows, ways.unnamed)
+    if looked_for.normal is not None:
+        rows = np.concatenate([rows, looked_for.normal[0]])
+        gradients = {n: np.concatenate([g, looked_for.normal[1][n]]) for n, g in gradients.items()}
+    found = [deterministic(n, axes[n], looked_for.values[n], g) for n, g in gradients.items()]
+    found += observed(problem, rows, looked_for.unnamed)
 
     def test(family: Family, scores: np.ndarray) -> FamilyTest:
         own, normal = np.split(scores, [len(drawn.rows)])
         return family_test(family, own, normal if len(normal) else None)
 
-    tested = [(site, [test(*family) for family in families(ways.along, ways.over, site)]) for site in found]
+    tested = [
+        (site, [test(*family) for family in families(looked_for.along, looked_for.over, site)])
+        for site in found
+    ]
     beyond: dict[str, list[FamilyTest]] = {}
     centre = projection.centre
     noise = drawn.rows if centre is None else centre.without_own(drawn.rows)  # no tail of own unknowns' prior
@@ -223,37 +182,7 @@ def _test_sites(
         for site, tests in tested
     ]
     further = [_beyond(name, tests, in_all) for name, tests in beyond.items()]
-    return _Tested(tested, findings, [*further, *ways.repeated])
-
-
-def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
-    """What the model computes and the data tell along several axes: a perturbation may vary over it."""
-    columns = _columns(problem)
-    computed = {name: (problem.declaration.sites[name].axes, value) for name, value in values.items()}
-    for name, (axes, value) in (columns | computed).items():
-        if (found := quantity(name, axes, value)) is not None:
-            yield replace(found, computed=name not in columns)
-    for name, (axes, value) in columns.items():
-        yield from groups(name, axes, value)
-    for axes, shape, given in _observed(problem):
-        yield from cells(axes, shape, given)
-
-
-def _columns(problem: Problem) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
-    """Axes and values of the columns of the data along several axes."""
-    return {
-        name: (site.axes, column)
-        for site in problem.declaration.observed.values()
-        for name, column in whole_columns(problem, site).items()
-    }
-
-
-def _observed(problem: Problem) -> Iterator[tuple[tuple[str, ...], tuple[int, ...], dict[str, np.ndarray]]]:
-    """Axes and shape of what is observed along several axes, each once, with the columns of the data there."""
-    seen = {(site.axes, site.shape): site for site in problem.declaration.observed.values()}
-    for (axes, shape), site in seen.items():
-        if len(shape) > 1:
-            yield axes, shape, all_columns(problem, site)
+    return _Tested(tested, findings, [*further, *looked_for.repeated])
 
 
 def _entries(site: Site, tests: Sequence[FamilyTest]) -> Iterator[np.ndarray]:
