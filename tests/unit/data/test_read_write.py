@@ -605,7 +605,7 @@ def test_a_table_takes_no_options(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("name", "told"), [("a.ZARR", "dtprob\\[zarr\\]"), ("a.parquet", "Install dtprob again")]
+    ("name", "told"), [("a.ZARR", "pip install zarr"), ("a.parquet", "Install dtprob again")]
 )
 def test_a_package_that_is_not_installed_is_named(tmp_path, monkeypatch, name, told):
     (tmp_path / name).mkdir()
