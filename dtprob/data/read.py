@@ -2,7 +2,7 @@
 
 import os
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from pathlib import Path
 from typing import Any, Final
 
@@ -106,16 +106,29 @@ def _interpret(arrays: Arrays, options: Mapping[str, Any], *, matlab: bool) -> D
     if "y" in names and names & {"x", "x_0"}:
         return _labels(arrays, matlab=matlab)
     if names & set(CHANNEL_ARRAYS):
-        for name in names - _CANONICAL:
-            raise unknown_name("array", name, _CANONICAL, "array name")
+        _check_names(arrays, _CANONICAL)
         return _channels(arrays, matlab=matlab)
     return Table(_columns(arrays, matlab=matlab))
 
 
-def _channels(arrays: Arrays, *, matlab: bool) -> ChannelData:
+def _check_names(arrays: Arrays, known: Collection[str], valid: Collection[str] = ()) -> None:
+    """Refuse the first array whose name is not known.
+
+    Args:
+        arrays: by name.
+        known: the names that may be there.
+        valid: the names that a user can write, where they are others.
+
+    Raises:
+        InputError: see above.
+    """
     for name in arrays:
-        if name not in CHANNEL_ARRAYS:
-            raise unknown_name("array", name, CHANNEL_ARRAYS, "array name")
+        if name not in known:
+            raise unknown_name("array", name, valid or known, "array name")
+
+
+def _channels(arrays: Arrays, *, matlab: bool) -> ChannelData:
+    _check_names(arrays, CHANNEL_ARRAYS)
     if "channel" not in arrays:
         shape = "(link, snapshot, rx_antenna, tx_antenna, subcarrier)"
         raise InputError("channel", f"an array of shape {shape}", "nothing", "Add this array to the data")
@@ -154,10 +167,7 @@ def _powers(arrays: Arrays, *, matlab: bool) -> PowerData:
             expected, remedy = "a positive linear power (W), that of 0 dB", "Give 1e-3 for dBm, 1 for a ratio"
             raise InputError("power_reference", expected, f"{reference.item():g}", remedy)
         arrays["power"] = reference.item() * 10.0 ** (np.asarray(decibels, dtype=float) / 10.0)
-    valid = [*POWER_ARRAYS, "power_db", "power_reference"]
-    for name in arrays:
-        if name not in POWER_ARRAYS:
-            raise unknown_name("array", name, valid, "array name")
+    _check_names(arrays, POWER_ARRAYS, [*POWER_ARRAYS, "power_db", "power_reference"])
     given = arrays.get("power")
     if given is not None and given.dtype.kind in "fiu" and (given < 0).any():
         remedy = (

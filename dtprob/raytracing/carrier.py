@@ -9,6 +9,8 @@ from dtprob.errors import InputError
 
 _CARRIER: Final = "dtprob_carrier"
 """Attribute of a scene: the carrier at which its materials were fixed, in Hz, as the scene holds it."""
+_LEAST: Final = 1e6
+"""Carriers below this, in Hz, are numbers in GHz or MHz by mistake."""
 _LAW: Final = "dtprob_law"
 """Attribute of a material: its `_Law`, taken from it so that it keeps its values."""
 
@@ -18,6 +20,20 @@ class _Law(NamedTuple):
 
     callback: Callable[[Any], Any]
     values: tuple[float, float]
+
+
+def check_carrier(where: str, frequency: float) -> None:
+    """Refuse a carrier that cannot be in Hz.
+
+    Args:
+        where: it was given, in words.
+        frequency: the number.
+
+    Raises:
+        InputError: it is below 1 MHz, or no number.
+    """
+    if not frequency >= _LEAST:
+        raise InputError(where, "a frequency in Hz, such as 3.5e9", f"{frequency:g}", "Give it in Hz")
 
 
 def set_frequency(scene: Any, frequency: float) -> Any:

@@ -8,10 +8,9 @@ from jaxtyping import Bool, Complex, Float
 from scipy.constants import speed_of_light
 
 from dtprob.errors import InputError
+from dtprob.raytracing.carrier import check_carrier
 from dtprob.raytracing.paths import PathSet, validate
 
-_LEAST_CARRIER: Final = 1e6
-"""Carriers below this, in Hz, are numbers in GHz or MHz by mistake."""
 _LONGEST: Final = 1e4
 """A link's shortest path is no longer than this many straight lines, or as many metres where that is more."""
 _STRAIGHT: Final = 1e-3
@@ -60,9 +59,7 @@ def path_set(imported: ImportedPaths, frequency: float, provenance: tuple[tuple[
             ends, a straight path whose directions do not, or such a carrier.
     """
     mask = imported.mask
-    if not frequency >= _LEAST_CARRIER:
-        expected = "a frequency in Hz, such as 3.5e9"
-        raise InputError("carrier of the imported paths", expected, f"{frequency:g}", "Give it in Hz")
+    check_carrier("carrier of the imported paths", frequency)
     if not mask.any():
         raise InputError("imported paths", "a path or more", "none", "Export links that are reached")
     delay = np.where(mask, imported.delay, 0.0).astype(np.float64)

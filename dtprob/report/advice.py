@@ -6,6 +6,7 @@ from typing import Final
 
 from dtprob.report.json_schema import Size
 from dtprob.report.names import words
+from dtprob.report.sizes import key_of
 
 ADVICE: Mapping[str, str] = {
     # channel
@@ -118,14 +119,14 @@ def advice(effect: str, size: Mapping[str, Size] = MappingProxyType({})) -> str:
 def worth_telling(effects: Sequence[str], size: Mapping[str, Size]) -> dict[str, Size]:
     """The sizes without those that mean nothing: the phase of an element that is dead."""
     dead = [e for e in effects if advice(e, size) == DEAD_ELEMENT]
-    idle = {key for e in dead for key in ("phase_rad", f"{e}.phase_rad")}
+    idle = {key_of(e, "phase_rad", size) for e in dead}
     return {name: one for name, one in size.items() if name not in idle}
 
 
 def _lacks(effect: str, size: Mapping[str, Size]) -> float | None:
     """The share of its amplitude that one element lacks; None of a whole array."""
-    found = size.get("fraction") or size.get(f"{effect}.fraction")
-    return None if found is None else found["mean"]
+    key = key_of(effect, "fraction", size)
+    return None if key is None else size[key]["mean"]
 
 
 def family(effect: str) -> str:

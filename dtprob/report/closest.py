@@ -3,7 +3,7 @@
 from dtprob.report.json_schema import Candidate, Cause, Report
 from dtprob.report.names import LEVEL, listing, together, words
 from dtprob.report.next_step import left_over
-from dtprob.report.sizes import size_reading
+from dtprob.report.sizes import key_of, size_reading
 
 _PLACE = ("x_m", "y_m", "z_m")
 """Sizes that say where in the scene an effect acts."""
@@ -71,10 +71,10 @@ def _most_asked(rows: list[Candidate]) -> Candidate | None:
 
 def _place(effect: str, cause: Cause) -> str:
     """`x 38.1 m and y 13.1 m`, nothing where the effect has no place."""
-    keys = [(key, f"{effect}.{key}" if len(cause["effects"]) > 1 else key) for key in _PLACE]
+    keys = [(name, key_of(effect, name, cause["size"])) for name in _PLACE]
     told = [
-        f"{key[0]} {size_reading(key, cause['size'][whole])[1].mean_with_unit}"
-        for key, whole in keys
-        if whole in cause["size"]
+        f"{name[0]} {size_reading(name, cause['size'][key])[1].mean_with_unit}"
+        for name, key in keys
+        if key is not None
     ]
     return listing(told)

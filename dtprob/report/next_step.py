@@ -21,13 +21,10 @@ _MUCH = 1.5
 LEAVE_OUT = "Leave out the copies, readings that are in the data twice, and diagnose again: copies make gaps of their own."
 
 
-def is_read_twice(report: Report) -> bool:
-    """Whether readings are in the data twice, as those of a log that was read twice."""
-    return (
-        any(READ_TWICE in warning for warning in report["fit"].get("warnings", []))
-        if "fit" in report
-        else False
-    )
+def copies(report: Report) -> list[str]:
+    """What warnings say of readings that are in the data twice, as those of a log that was read twice."""
+    warnings = report["fit"].get("warnings", []) if "fit" in report else []
+    return [warning for warning in warnings if READ_TWICE in warning]
 
 
 def rivals(report: Report) -> list[list[str]]:
@@ -80,7 +77,7 @@ def _places(value: Any) -> str:
 
 def next_look(report: Report) -> str:
     """Where to look for an unknown cause: the block of the data that shows it most, the quantity that must change."""
-    if is_read_twice(report):
+    if copies(report):
         return LEAVE_OUT
     blocks, left = significant(report["where"]["coordinates"]), left_over(report)
     where = (

@@ -7,12 +7,12 @@ from typing import Any
 import xarray as xr
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from dtprob.gap.vocabulary import READ_TWICE, UNSEEN
+from dtprob.gap.vocabulary import UNSEEN
 from dtprob.report import names, sizes, units
 from dtprob.report.charts import all_charts
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Candidate, Interval, Report, Tried, is_quiet, validate
-from dtprob.report.next_step import left_over, next_look, next_step, rivals
+from dtprob.report.next_step import copies, left_over, next_look, next_step, rivals
 from dtprob.report.palette import DARK, LIGHT
 from dtprob.report.quiet import nearly
 from dtprob.report.story import tell
@@ -60,6 +60,7 @@ def render(report: Mapping[str, Any], gap: xr.DataTree | None, *, title: str) ->
             others=others(checked),
             left_over=left_over(checked),
             nearly=nearly(checked),
+            copies=copies(checked),
             next_look=next_look(checked),
             charts={section: [chart for name, chart in charts if name == section] for section, _ in charts},
             candidates=candidates,
@@ -129,8 +130,7 @@ def environment() -> Environment:
         lstrip_blocks=True,
     )
     made.filters |= {function.__name__: function for function in _FILTERS}
-    words = {"UNSEEN": UNSEEN, "READ_TWICE": READ_TWICE}
-    made.globals |= dict[str, Any]({function.__name__: function for function in _FUNCTIONS}, **words)
+    made.globals |= dict[str, Any]({function.__name__: function for function in _FUNCTIONS}, UNSEEN=UNSEEN)
     return made
 
 

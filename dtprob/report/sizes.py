@@ -1,7 +1,7 @@
 """Sizes of effects as people say them: in human units, as factors and shares."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Final
 
 from dtprob.report.json_schema import Meaning, Size
@@ -11,6 +11,17 @@ from dtprob.report.units import Reading, decimals_between, number, reading, scal
 LOG: Final = "log_"
 _LARGEST: Final = 700.0
 """Largest exponent whose exponential is a number."""
+
+
+def key_of(effect: str, parameter: str, size: Mapping[str, Size]) -> str | None:
+    """The key of an effect's parameter among the sizes of its cause, None where it has none such.
+
+    Args:
+        effect: its name, which keys begin with where a cause is several effects.
+        parameter: with its unit, as in report.json.
+        size: of the cause.
+    """
+    return next((key for key in (f"{effect}.{parameter}", parameter) if key in size), None)
 
 
 def size_reading(name: str, size: Size) -> tuple[str, Reading]:

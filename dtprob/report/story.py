@@ -23,7 +23,7 @@ from dtprob.report.names import (
     whereabouts,
     words,
 )
-from dtprob.report.next_step import LEAVE_OUT, changed, decides, is_read_twice, left_over, next_step, rivals
+from dtprob.report.next_step import LEAVE_OUT, changed, copies, decides, left_over, next_step, rivals
 from dtprob.report.quiet import nearly, nothing_found
 from dtprob.report.sizes import size_reading
 from dtprob.report.units import percent
@@ -56,7 +56,7 @@ def tell(report: Report) -> Story:
 
 def _without_copies(story: Story, report: Report) -> Story:
     """The story whose first step is to leave readings out that are in the data twice: they make gaps of their own."""
-    if not is_read_twice(report):
+    if not copies(report):
         return story
     rest = "" if is_quiet(report) else f" Should a gap remain, {story.action[:1].lower()}{story.action[1:]}"
     return replace(story, action=f"{LEAVE_OUT}{rest}")

@@ -23,14 +23,13 @@ from dtprob.effects.solver import DEPTH, REFRACTION
 from dtprob.errors import InputError
 from dtprob.raytracing import storage
 from dtprob.raytracing.beyond import strongest, with_beyond
+from dtprob.raytracing.carrier import check_carrier
 from dtprob.raytracing.paths import PathSet
 from dtprob.workflow.plausible import doubts, strayed
 
 _WALL_THICKNESS = 0.12
 _APART = 1e-2
 """Ends closer than this, in m, cannot be traced."""
-_LEAST_CARRIER = 1e6
-"""Carriers below this, in Hz, are numbers in GHz or MHz by mistake."""
 _MOST_BEYOND = 64
 """Paths of another trace that are kept for each link where the case does not say."""
 _MOST_ELSEWHERE = 8
@@ -105,11 +104,10 @@ def paths_of(
         if isinstance(data, ChannelData):
             check_tones(data.subcarrier_frequency, paths.frequency)
         return paths
-    if scene.frequency is not None and scene.frequency < _LEAST_CARRIER:
-        where, got = f"{case.path.name} [scene] frequency", f"{scene.frequency:g}"
-        raise InputError(where, "the carrier in Hz, such as 3.5e9", got, "Write it in Hz")
-    if scene.frequency is not None and isinstance(data, ChannelData):
-        check_tones(data.subcarrier_frequency, scene.frequency)
+    if scene.frequency is not None:
+        check_carrier(f"{case.path.name} [scene] frequency", scene.frequency)
+        if isinstance(data, ChannelData):
+            check_tones(data.subcarrier_frequency, scene.frequency)
     kept = None if cache is None else cache / f"paths-{_scene_hash(scene, data)}.nc"
     if kept is not None and kept.is_file():
         say(f"taking the paths that were traced before, {kept.name}")

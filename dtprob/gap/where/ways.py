@@ -21,6 +21,9 @@ from dtprob.gap.where.quantities import Quantity, cells, groups, of_each, quanti
 from dtprob.gap.where.repeats import repeats
 from dtprob.gap.where.site_finding import SiteFinding
 
+type Columns = dict[str, tuple[tuple[str, ...], np.ndarray]]
+"""Axes and values of columns, by name."""
+
 
 class Ways(NamedTuple):
     """How sites may be wrong, whatever the replicates.
@@ -47,7 +50,7 @@ def ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> Ways:
 
     Args:
         problem: the model on its data.
-        x: a fit, to other data or as the priors have it.
+        x: the flat vector of the fit, with what the prior knows at its centre; see `Projection.origin`.
         drawn: replicates at the fit.
     """
     at = problem.compiled.sites(x)
@@ -55,22 +58,21 @@ def ways(problem: Problem, x: np.ndarray, drawn: Replicates) -> Ways:
     along = functools.cache(functools.partial(curves, problem))  # sites share their axes
     knowing = conditioned(problem, x)
     apart = {n: value for n, value in values.items() if n not in knowing}
-    over = [(q, tuple(q.curves())) for q in _quantities(problem, apart)]
+    columns = _columns(problem)
+    over = [(q, tuple(q.curves())) for q in _quantities(problem, apart, columns)]
     over += [
         (q, (found,))
         for axes, shape, given in _observed(problem)
         for q, found in together(axes, shape, given)
     ]
-    each = _columns(problem)
-    over += [(q, (found,)) for n, (axes, value) in each.items() for q, found in of_each(n, axes, value)]
+    over += [(q, (found,)) for n, (axes, value) in columns.items() for q, found in of_each(n, axes, value)]
     discrete = any(is_discrete(family) for family in problem.families.values())
     normal = normal_like(drawn) if discrete else None
     return Ways(values, along, over, unnamed(problem, x), normal, tuple(repeats(problem, x)))
 
 
-def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[Quantity]:
+def _quantities(problem: Problem, values: Mapping[str, np.ndarray], columns: Columns) -> Iterator[Quantity]:
     """What the model computes and the data tell along several axes: a perturbation may vary over it."""
-    columns = _columns(problem)
     computed = {name: (problem.declaration.sites[name].axes, value) for name, value in values.items()}
     for name, (axes, value) in (columns | computed).items():
         if (found := quantity(name, axes, value)) is not None:
@@ -81,7 +83,7 @@ def _quantities(problem: Problem, values: Mapping[str, np.ndarray]) -> Iterator[
         yield from cells(axes, shape, given)
 
 
-def _columns(problem: Problem) -> dict[str, tuple[tuple[str, ...], np.ndarray]]:
+def _columns(problem: Problem) -> Columns:
     """Axes and values of the columns of the data along several axes."""
     return {
         name: (site.axes, column)
