@@ -74,6 +74,23 @@ def test_what_a_smaller_gap_hides_is_looked_for_with_clusters_own_unknowns_found
     assert trials._scans(cast("Any", seen)) == [{}, found, found, {}]
 
 
+@pytest.mark.parametrize(("promise", "looks"), [(79.0, True), (20.0, False)])
+def test_far_looks_begin_at_a_gap_of_thirty_nats(monkeypatch, promise, looks):
+    class LookError(Exception):
+        """Before any refit."""
+
+    def stop(*_):
+        raise LookError
+
+    monkeypatch.setattr(trials, "_scans", stop)
+    monkeypatch.setattr(trials, "_chosen", lambda *_: pytest.fail("no look") if looks else stop())
+    seen = SimpleNamespace(promise=promise, fitted=SimpleNamespace(effects=()), screening=None)
+    told = []
+    with pytest.raises(LookError):
+        trials.tried(cast("Any", seen), Settings(), told.append)
+    assert bool(told) is looks
+
+
 def test_what_gains_nothing_or_is_absorbed_is_not_refitted():
     scans = [{"wall": 2.0, "tilt": np.inf}, {}]
     assert chosen({"near": 90.0, "far": 1.0}, scans, 6, absorbed=("tilt",)) == ["near"]
