@@ -66,7 +66,7 @@ def catalogue(sites: Sites, data: Data, use: str | Iterable[str | Effect] = "all
             site that the model lacks, or two effects have one name.
     """
     if use == "all":
-        return _unique([effect for family in FAMILIES for effect in _offered(family, sites, data)])
+        return _unique([effect for family in FAMILIES for effect in instances(family, sites, data)])
     chosen: list[Effect] = []
     for entry in [use] if isinstance(use, str) else use:
         if isinstance(entry, Effect):
@@ -108,8 +108,14 @@ def summaries() -> dict[str, str]:
     return {name: (family.__doc__ or "").strip().splitlines()[0] for name, family in FAMILIES.items()}
 
 
-def _offered(family: str, sites: Sites, data: Data) -> list[Effect]:
-    """The instances of a family that find what they need by the time that the model computes their sites."""
+def instances(family: str, sites: Sites, data: Data) -> list[Effect]:
+    """The instances of a family that find what they need by the time that the model computes their sites.
+
+    Args:
+        family: a name of `FAMILIES`.
+        sites: `declare(model, data).sites`.
+        data: the model's arguments by name, with concrete arrays.
+    """
     return [effect for effect in FAMILIES[family](sites, data) if _finds_its_needs(effect, sites, data)]
 
 
@@ -126,7 +132,7 @@ def _named(name: str, sites: Sites, data: Data) -> list[Effect]:
     family = name.partition("[")[0]
     if family not in FAMILIES:
         raise unknown_name("effects", name, FAMILIES, "effect family")
-    offered = _offered(family, sites, data)
+    offered = instances(family, sites, data)
     found = offered if name == family else [effect for effect in offered if effect.name == name]
     if found:
         return found

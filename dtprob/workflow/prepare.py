@@ -16,6 +16,7 @@ from dtprob.case import Case, EngineSection
 from dtprob.data import ChannelData, Data, PowerData, Table, read, read_table
 from dtprob.data.location import located
 from dtprob.effects import Effect, catalogue, summaries, with_effects
+from dtprob.effects.library import FAMILIES, instances
 from dtprob.errors import InputError, unknown_name
 from dtprob.files import sha256
 from dtprob.inference.engine import AbstractEngine
@@ -123,7 +124,7 @@ def prepare(
             say(f"reading {case.data.designs.name}")
             found = _arguments(case, model, case.data.designs, cache, say, observed=False)
             designs = {case.data.designs.stem: found}
-        effects = _effects(case, model, arguments)
+        effects = _effects(case, model, arguments, say)
     model = _extended(case, model, arguments)
     key, digest = jax.random.key(case.seed.value), sha256(case.data.file)
     cluster = case.data.cluster
@@ -276,12 +277,17 @@ def _frozen(value: Any) -> Any:
     return tuple(_frozen(entry) for entry in value) if isinstance(value, list) else value
 
 
-def _effects(case: Case, model: Model, arguments: Mapping[str, Any]) -> tuple[Effect, ...]:
+def _effects(case: Case, model: Model, arguments: Mapping[str, Any], say: Say) -> tuple[Effect, ...]:
+    """The candidates; of a list of families those that neither model nor data allow are left out with a note."""
     sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
     use = case.effects.use
     chosen: list[str | Effect] = []
     for name in (use,) if isinstance(use, str) else use:
         chosen += _own_effects(name, case) if ":" in name else [name]
+    idle = [name for name in chosen if name in FAMILIES and not instances(str(name), sites, arguments)]
+    if 0 < len(idle) < len(chosen):
+        say(f"note: left out, since neither model nor data allow them: {', '.join(map(str, idle))}")
+        chosen = [name for name in chosen if name not in idle]
     offered = catalogue(sites, arguments, use="all" if use == "all" else chosen)
     left_out = case.effects.exclude
     known = {*summaries(), *(n for effect in offered for n in (effect.name, effect.family))}

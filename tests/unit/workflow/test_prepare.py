@@ -79,6 +79,22 @@ def test_effects_by_name_and_without_some(folder):
     assert {effect.family for effect in prepared.effects} == {"timing_offset"}
 
 
+def test_families_that_nothing_allows_are_left_out_of_a_list_with_a_note(folder):
+    change(folder, 'use = "all"', 'use = ["timing_offset", "arrival_rate_shift", "stale_map"]')
+    told: list[str] = []
+    prepared = prepare(load_case(folder / "case.toml"), need="diagnosis", say=told.append)
+    assert {effect.family for effect in prepared.effects} == {"timing_offset"}
+    [note] = [line for line in told if line.startswith("note")]
+    assert note.endswith("arrival_rate_shift, stale_map")
+
+
+@pytest.mark.parametrize("use", ['["arrival_rate_shift", "stale_map"]', '["timing_offset", "stale_mop"]'])
+def test_a_list_of_which_nothing_is_allowed_and_an_unknown_name_are_refused(folder, use):
+    change(folder, 'use = "all"', f"use = {use}")
+    with pytest.raises(InputError, match="effect"):
+        prepare(load_case(folder / "case.toml"), need="diagnosis")
+
+
 @pytest.mark.parametrize("need", ["fit", "diagnosis"])
 def test_known_effects_are_unknowns_of_the_model_and_no_candidates(folder, need):
     change(folder, 'use = "all"', 'use = ["timing_offset", "gain_offset"]\nknown = ["timing_offset"]')
