@@ -247,8 +247,9 @@ def _causes(
     strata = tuple(float(v) for v in estimates[:, 0])
     physics = " ".join(e.physics for e in effects if e.physics)
     held, but_for_fields = (evidence.held_before, evidence.held_after), evidence.floor.of_known_fields
+    closes = {share.effect: share.mean for share in evidence.shares}
     cause = Cause(
-        effects=evidence.accepted,
+        effects=tuple(sorted(evidence.accepted, key=lambda name: -closes.get(name, 0.0))),
         alias_class=classes,
         probability=probability,
         size=sizes,

@@ -33,7 +33,7 @@ class Cause:
     """A set of effects that explains the gap, with the sets that the data cannot tell from it.
 
     Attributes:
-        effects: names.
+        effects: names, what closes most first.
         alias_class: equally good sets, this one first.
         probability: among the sets that were refitted.
         size: posterior of each scalar parameter.

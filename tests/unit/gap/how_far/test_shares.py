@@ -7,10 +7,13 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from dtprob.gap.diagnose import diagnose
 from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.how_far import closed
 from dtprob.gap.how_far.shares import shapley, shares
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.settings import Settings
+from dtprob.inference import Laplace
 from tests.unit.gap.examples import SIGMA, bend, draw, inputs, line, ripple, saturation
 
 
@@ -85,3 +88,15 @@ def test_what_two_effects_can_both_explain_is_nobodys_own():
 
 def test_one_effect_needs_no_shares():
     assert shared([bend()], 0.6 * inputs() ** 2)[2] == ()
+
+
+@pytest.mark.parametrize("offered", [[bend(), ripple()], [ripple(), bend()]])
+def test_what_closes_most_is_named_first(offered):
+    x = inputs()
+    data = draw("line", shift=0.4 * x**2 + 1.5 * np.sin(3 * x))
+    settings = Settings(replicates=40, site_replicates=20)
+    found = diagnose(line, data, offered, engine=Laplace(), key=jax.random.key(0), settings=settings)
+    shares = {share.effect: share.mean for share in found.causes[0].shares}
+    assert shares["ripple"] > shares["bend"] > 0
+    assert found.causes[0].effects == ("ripple", "bend")
+    assert "ripple and bend" in found.summary
