@@ -1,8 +1,8 @@
 """What is said where no gap was found: what was tried, what would have been seen, and what came near to one."""
 
 from dtprob.report.detectable import detectable_families
-from dtprob.report.json_schema import Detectable, Report, Site
-from dtprob.report.names import LEVEL, listing, located_words, whereabouts
+from dtprob.report.json_schema import Candidate, Detectable, Report, Site
+from dtprob.report.names import LEVEL, listing, located_words, whereabouts, words
 from dtprob.report.units import DASH, p_value
 
 
@@ -11,6 +11,17 @@ def nearly(report: Report) -> Site | None:
     told = [(site["p_value"], site) for site in report["where"]["sites"] if site["p_value"] is not None]
     p, site = min(told, key=lambda one: one[0], default=(1.0, None))
     return site if p < LEVEL else None
+
+
+def nearest(report: Report) -> Candidate | None:
+    """The effect that the data call for by what may be more than chance among all that were tried; None where none does."""
+    told = [(row["adjusted_p_value"], row) for row in report.get("screening", []) if _is_judged(row)]
+    p, row = min(((p, row) for p, row in told if p is not None), key=lambda one: one[0], default=(1.0, None))
+    return row if p < LEVEL else None
+
+
+def _is_judged(row: Candidate) -> bool:
+    return not row.get("absorbed_by")
 
 
 def nothing_found(report: Report) -> str:
@@ -23,8 +34,9 @@ def nothing_found(report: Report) -> str:
             else "; the twin's own quantities differ from the data by no more than chance"
         )
         return f"No effects were given to try{rest}.{_doubt(near)}"
-    judged = sum(not row.get("absorbed_by") for row in screened)
-    return f"{_tried(judged, near)}{_doubt(near)} {_seen(report['detectable'])}"
+    judged, candidate = sum(map(_is_judged, screened)), nearest(report)
+    called = "" if candidate is None else _called_for(candidate)
+    return f"{_tried(judged, near)}{_doubt(near)}{called} {_seen(report['detectable'])}"
 
 
 def _tried(judged: int, near: Site | None) -> str:
@@ -43,6 +55,12 @@ def _doubt(near: Site | None) -> str:
         return ""
     where, p = f"{located_words(near)}{whereabouts(near)}", p_value(near["p_value"])
     return f" What is left in the {where} may be more than chance (p = {p}), but is too little to be called a gap."
+
+
+def _called_for(candidate: Candidate) -> str:
+    """Which effect came near to being a cause."""
+    who, p = words(candidate["effect"]), p_value(candidate["adjusted_p_value"])
+    return f" Of the known effects the data call most for {who}, which may be chance (p = {p} among all that were tried)."
 
 
 def _seen(detectable: list[Detectable]) -> str:

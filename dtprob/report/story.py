@@ -24,7 +24,7 @@ from dtprob.report.names import (
     words,
 )
 from dtprob.report.next_step import LEAVE_OUT, changed, copies, decides, left_over, next_step, rivals
-from dtprob.report.quiet import nearly, nothing_found
+from dtprob.report.quiet import nearest, nearly, nothing_found
 from dtprob.report.sizes import size_reading
 from dtprob.report.units import percent
 
@@ -84,12 +84,13 @@ def _codes(report: Report) -> set[str]:
 def _no_gap(report: Report) -> Story:
     if not is_quiet(report):
         return _tolerated(report)
-    near = nearly(report)
-    doubt = (
-        ""
-        if near is None
-        else f" More data of the same kind would tell whether the {located_words(near)} are right."
-    )
+    near, candidate = nearly(report), nearest(report)
+    open_questions = [
+        *([] if near is None else [f"the {located_words(near)} are right"]),
+        *([] if candidate is None else [f"{words(candidate['effect'])} is there"]),
+    ]
+    asked = " and whether ".join(open_questions)
+    doubt = f" More data of the same kind would tell whether {asked}." if asked else ""
     return Story(
         "No gap found",
         "good",

@@ -508,6 +508,24 @@ def test_what_came_near_to_a_gap_is_said_with_its_place() -> None:
         assert ("by no more than chance" in tell(bare).meaning) != near
 
 
+@pytest.mark.parametrize(
+    ("adjusted", "absorbed", "near"), [(0.03, None, True), (0.3, None, False), (0.03, "gain", False)]
+)
+def test_which_effect_came_near_to_being_a_cause_is_said(adjusted, absorbed, near) -> None:
+    row = {
+        "effect": "phase_noise",
+        "sites": ["phase"],
+        "z": 3.6,
+        "p_value": 3e-4,
+        "adjusted_p_value": adjusted,
+    }
+    other = {**row, "effect": "clipping", "adjusted_p_value": 0.9}
+    report = {**_report(), "verdict": "NO_GAP", "causes": [], "where": {"sites": [], "coordinates": []}}
+    story = tell({**report, "screening": [other, {**row, "absorbed_by": absorbed}]})
+    assert ("call most for phase noise, which may be chance (p = 0.03" in story.meaning) == near
+    assert ("would tell whether phase noise is there." in story.action) == near
+
+
 NOISE = {
     "effect": "heavy_tailed_noise",
     "sites": ["channel"],
