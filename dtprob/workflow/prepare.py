@@ -284,10 +284,11 @@ def _effects(case: Case, model: Model, arguments: Mapping[str, Any], say: Say) -
     chosen: list[str | Effect] = []
     for name in (use,) if isinstance(use, str) else use:
         chosen += _own_effects(name, case) if ":" in name else [name]
-    idle = [name for name in chosen if name in FAMILIES and not instances(str(name), sites, arguments)]
+    families = [name for name in chosen if isinstance(name, str) and name in FAMILIES]
+    idle = [name for name in families if not instances(name, sites, arguments)]
     if 0 < len(idle) < len(chosen):
-        say(f"note: left out, since neither model nor data allow them: {', '.join(map(str, idle))}")
-        chosen = [name for name in chosen if name not in idle]
+        say(f"note: left out, since neither model nor data allow them: {', '.join(idle)}")
+        chosen = [entry for entry in chosen if not isinstance(entry, str) or entry not in idle]
     offered = catalogue(sites, arguments, use="all" if use == "all" else chosen)
     left_out = case.effects.exclude
     known = {*summaries(), *(n for effect in offered for n in (effect.name, effect.family))}
