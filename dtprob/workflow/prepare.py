@@ -98,6 +98,7 @@ def prepare(
         expected = "a model and effects of dtprob, since --no-code is given"
         remedy = "Leave --no-code out if you trust this code"
         raise InputError(f"{case.path.name}", expected, f"the code {', '.join(case.user_code)}", remedy)
+    _check_families(case)
     case = dataclasses.replace(case, data=dataclasses.replace(case.data, file=located(case.data.file)))
     engine = make_engine(case.engine, f"{case.path.name} [engine]")
     model = _model(case)
@@ -275,6 +276,14 @@ def _options(
 def _frozen(value: Any) -> Any:
     """Lists as tuples, so that settings can be compared and hashed."""
     return tuple(_frozen(entry) for entry in value) if isinstance(value, list) else value
+
+
+def _check_families(case: Case) -> None:
+    """Refuse names of which the library has no family, which a fit would not look at."""
+    use = case.effects.use
+    for name in () if use == "all" else (use,) if isinstance(use, str) else use:
+        if ":" not in name and name.partition("[")[0] not in FAMILIES:
+            raise unknown_name(f"{case.path.name} [effects] use", name, FAMILIES, "effect family")
 
 
 def _effects(case: Case, model: Model, arguments: Mapping[str, Any], say: Say) -> tuple[Effect, ...]:

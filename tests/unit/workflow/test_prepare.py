@@ -96,6 +96,15 @@ def test_a_list_of_which_nothing_is_allowed_and_an_unknown_name_are_refused(fold
 
 
 @pytest.mark.parametrize("need", ["fit", "diagnosis"])
+def test_an_unknown_effect_is_refused_before_the_data_are_read(folder, need):
+    change(folder, 'use = "all"', 'use = ["timing_offset", "gain_ofset"]')
+    told: list[str] = []
+    with pytest.raises(InputError, match=r"case.toml \[effects\] use.*gain_offset"):
+        prepare(load_case(folder / "case.toml"), need=need, say=told.append)
+    assert not told
+
+
+@pytest.mark.parametrize("need", ["fit", "diagnosis"])
 def test_known_effects_are_unknowns_of_the_model_and_no_candidates(folder, need):
     change(folder, 'use = "all"', 'use = ["timing_offset", "gain_offset"]\nknown = ["timing_offset"]')
     prepared = prepare(load_case(folder / "case.toml"), need=need)
