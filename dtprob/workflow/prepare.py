@@ -15,21 +15,18 @@ import numpy as np
 from dtprob.case import Case, EngineSection
 from dtprob.data import ChannelData, Data, PowerData, Table, read, read_table
 from dtprob.data.location import located
-from dtprob.effects import Effect, catalogue, summaries, with_effects
-from dtprob.effects.library import FAMILIES, instances
+from dtprob.effects import Effect
 from dtprob.errors import InputError, unknown_name
 from dtprob.files import sha256
 from dtprob.inference.engine import AbstractEngine
 from dtprob.inference.fit import ENGINES
 from dtprob.models.arguments import Model, taking
-from dtprob.models.declaration import declare
 from dtprob.usercode import load_object, source_files
+from dtprob.workflow.candidates import Say, candidates, check_families, extended
 from dtprob.workflow.columns import check_columns
 from dtprob.workflow.models import MODELS
 from dtprob.workflow.scene import reached, scene_files
 from dtprob.workflow.words import check_words, coded
-
-type Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -98,7 +95,7 @@ def prepare(
         expected = "a model and effects of dtprob, since --no-code is given"
         remedy = "Leave --no-code out if you trust this code"
         raise InputError(f"{case.path.name}", expected, f"the code {', '.join(case.user_code)}", remedy)
-    _check_families(case)
+    check_families(case)
     case = dataclasses.replace(case, data=dataclasses.replace(case.data, file=located(case.data.file)))
     engine = make_engine(case.engine, f"{case.path.name} [engine]")
     model = _model(case)
@@ -125,8 +122,8 @@ def prepare(
             say(f"reading {case.data.designs.name}")
             found = _arguments(case, model, case.data.designs, cache, say, observed=False)
             designs = {case.data.designs.stem: found}
-        effects = _effects(case, model, arguments, say)
-    model = _extended(case, model, arguments)
+        effects = candidates(case, model, arguments, say)
+    model = extended(case, model, arguments)
     key, digest = jax.random.key(case.seed.value), sha256(case.data.file)
     cluster = case.data.cluster
     sources = [
@@ -276,74 +273,3 @@ def _options(
 def _frozen(value: Any) -> Any:
     """Lists as tuples, so that settings can be compared and hashed."""
     return tuple(_frozen(entry) for entry in value) if isinstance(value, list) else value
-
-
-def _check_families(case: Case) -> None:
-    """Refuse names of which the library has no family, which a fit would not look at."""
-    use = case.effects.use
-    for name in () if use == "all" else (use,) if isinstance(use, str) else use:
-        if ":" not in name and name.partition("[")[0] not in FAMILIES:
-            raise unknown_name(f"{case.path.name} [effects] use", name, FAMILIES, "effect family")
-
-
-def _effects(case: Case, model: Model, arguments: Mapping[str, Any], say: Say) -> tuple[Effect, ...]:
-    """The candidates; of a list of families those that neither model nor data allow are left out with a note."""
-    sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
-    use = case.effects.use
-    chosen: list[str | Effect] = []
-    for name in (use,) if isinstance(use, str) else use:
-        chosen += _own_effects(name, case) if ":" in name else [name]
-    families = [name for name in chosen if isinstance(name, str) and name in FAMILIES]
-    idle = [name for name in families if not instances(name, sites, arguments)]
-    if 0 < len(idle) < len(chosen):
-        say(f"note: left out, since neither model nor data allow them: {', '.join(idle)}")
-        chosen = [entry for entry in chosen if not isinstance(entry, str) or entry not in idle]
-    offered = catalogue(sites, arguments, use="all" if use == "all" else chosen)
-    left_out = case.effects.exclude
-    known = {*summaries(), *(n for effect in offered for n in (effect.name, effect.family))}
-    for name in left_out:
-        if name not in known:
-            raise unknown_name(f"{case.path.name} [effects] exclude", name, known, "effect")
-    left_out = {*left_out, *case.effects.known}
-    return tuple(effect for effect in offered if not {effect.family, effect.name} & left_out)
-
-
-def _extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
-    """The model with the effects that are known, their parameters among its unknowns."""
-    if not case.effects.known:
-        return model
-    where = f"{case.path.name} [effects] known"
-    sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
-    use = case.effects.use
-    own = [e for n in ((use,) if isinstance(use, str) else use) if ":" in n for e in _own_effects(n, case)]
-    named = {effect.name: effect for effect in own if isinstance(effect, Effect)}
-    added: list[Effect] = []
-    for name in case.effects.known:
-        offered = {e.name: e for e in catalogue(sites, arguments, [named.get(name, name)])}
-        if name not in offered:
-            remedy = "Name one of the instances"
-            raise InputError(where, f"one effect ({', '.join(list(offered)[:8])})", repr(name), remedy)
-        if offered[name].kind == "variance":
-            expected = "effects with parameters of their own"
-            raise InputError(where, expected, f"the random field {name}", "Leave it among the candidates")
-        if offered[name].is_looked_for:
-            expected = "effects at a place of their own"
-            raise InputError(
-                where, expected, f"{name}, which may be anywhere", "Leave it among the candidates"
-            )
-        added.append(offered[name])
-    return with_effects(model, added)
-
-
-def _axis(case: Case, arguments: Mapping[str, Any]) -> str | None:
-    """The cluster when it is an axis of the model, not a column of the data."""
-    return None if case.data.cluster in arguments else case.data.cluster
-
-
-def _own_effects(name: str, case: Case) -> list[str | Effect]:
-    found = load_object(name, case.folder)
-    entries = [found] if isinstance(found, Effect) else found
-    if not isinstance(entries, list | tuple) or not all(isinstance(entry, Effect) for entry in entries):
-        where = f"{case.path.name} [effects] use"
-        raise InputError(where, "an Effect or a list of them", type(found).__name__, f"Correct {name}")
-    return list(entries)
