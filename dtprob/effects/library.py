@@ -127,11 +127,25 @@ def _finds_its_needs(effect: Effect, sites: Sites, data: Data) -> bool:
     return all(need in data or when.get(need, len(when)) <= latest[need] for need in effect.requires)
 
 
-def _named(name: str, sites: Sites, data: Data) -> list[Effect]:
-    """All instances of a family, or the one instance of that name."""
+def family_of(name: str, where: str = "effects") -> str:
+    """The family of a name of a family or an instance.
+
+    Args:
+        name: "doppler" or "array_calibration[rx_1]".
+        where: what an error says of the name's place.
+
+    Raises:
+        InputError: there is no such family.
+    """
     family = name.partition("[")[0]
     if family not in FAMILIES:
-        raise unknown_name("effects", name, FAMILIES, "effect family")
+        raise unknown_name(where, name, FAMILIES, "effect family")
+    return family
+
+
+def _named(name: str, sites: Sites, data: Data) -> list[Effect]:
+    """All instances of a family, or the one instance of that name."""
+    family = family_of(name)
     offered = instances(family, sites, data)
     found = offered if name == family else [effect for effect in offered if effect.name == name]
     if found:

@@ -1,5 +1,7 @@
 """What is said where no gap was found: what was tried, what would have been seen, and what came near to one."""
 
+from collections.abc import Iterable
+
 from dtprob.report.detectable import detectable_families
 from dtprob.report.json_schema import Candidate, Detectable, Report, Site
 from dtprob.report.names import LEVEL, listing, located_words, whereabouts, words
@@ -8,16 +10,19 @@ from dtprob.report.units import DASH, p_value
 
 def nearly(report: Report) -> Site | None:
     """The site that differs by what may be more than chance, though too little to be called a gap; None where none does."""
-    told = [(site["p_value"], site) for site in report["where"]["sites"] if site["p_value"] is not None]
-    p, site = min(told, key=lambda one: one[0], default=(1.0, None))
-    return site if p < LEVEL else None
+    return _least((site["p_value"], site) for site in report["where"]["sites"])
 
 
 def nearest(report: Report) -> Candidate | None:
     """The effect that the data call for by what may be more than chance among all that were tried; None where none does."""
-    told = [(row["adjusted_p_value"], row) for row in report.get("screening", []) if _is_judged(row)]
-    p, row = min(((p, row) for p, row in told if p is not None), key=lambda one: one[0], default=(1.0, None))
-    return row if p < LEVEL else None
+    return _least((row["adjusted_p_value"], row) for row in report.get("screening", []) if _is_judged(row))
+
+
+def _least[T](told: Iterable[tuple[float | None, T]]) -> T | None:
+    """What has the smallest p-value, if that may be more than chance."""
+    known = ((p, one) for p, one in told if p is not None)
+    p, one = min(known, key=lambda pair: pair[0], default=(1.0, None))
+    return one if p < LEVEL else None
 
 
 def _is_judged(row: Candidate) -> bool:

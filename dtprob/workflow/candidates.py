@@ -5,7 +5,8 @@ from typing import Any
 
 from dtprob.case import Case
 from dtprob.effects import Effect, catalogue, summaries, with_effects
-from dtprob.effects.library import FAMILIES, instances
+from dtprob.effects.common import Sites
+from dtprob.effects.library import FAMILIES, family_of, instances
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.arguments import Model
 from dtprob.models.declaration import declare
@@ -23,10 +24,9 @@ def check_families(case: Case) -> None:
     Raises:
         InputError: there is one.
     """
-    use = case.effects.use
-    for name in () if use == "all" else (use,) if isinstance(use, str) else use:
-        if ":" not in name and name.partition("[")[0] not in FAMILIES:
-            raise unknown_name(f"{case.path.name} [effects] use", name, FAMILIES, "effect family")
+    for name in _listed(case):
+        if not _is_code(name):
+            family_of(name, f"{case.path.name} [effects] use")
 
 
 def candidates(case: Case, model: Model, arguments: Mapping[str, Any], say: Say) -> tuple[Effect, ...]:
@@ -42,16 +42,8 @@ def candidates(case: Case, model: Model, arguments: Mapping[str, Any], say: Say)
         InputError: a name is unknown, nothing of what is named is allowed, or code of the user's own gives no effects.
     """
     sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
-    use = case.effects.use
-    chosen: list[str | Effect] = []
-    for name in (use,) if isinstance(use, str) else use:
-        chosen += _own_effects(name, case) if ":" in name else [name]
-    families = [name for name in chosen if isinstance(name, str) and name in FAMILIES]
-    idle = [name for name in families if not instances(name, sites, arguments)]
-    if 0 < len(idle) < len(chosen):
-        say(f"note: left out, since neither model nor data allow them: {', '.join(idle)}")
-        chosen = [entry for entry in chosen if not isinstance(entry, str) or entry not in idle]
-    offered = catalogue(sites, arguments, use="all" if use == "all" else chosen)
+    everything = case.effects.use == "all"
+    offered = catalogue(sites, arguments, "all" if everything else _chosen(case, sites, arguments, say))
     left_out = case.effects.exclude
     known = {*summaries(), *(n for effect in offered for n in (effect.name, effect.family))}
     for name in left_out:
@@ -76,9 +68,7 @@ def extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
         return model
     where = f"{case.path.name} [effects] known"
     sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
-    use = case.effects.use
-    own = [e for n in ((use,) if isinstance(use, str) else use) if ":" in n for e in _own_effects(n, case)]
-    named = {effect.name: effect for effect in own if isinstance(effect, Effect)}
+    named = {e.name: e for code in _listed(case) if _is_code(code) for e in _own_effects(code, case)}
     added: list[Effect] = []
     for name in case.effects.known:
         offered = {e.name: e for e in catalogue(sites, arguments, [named.get(name, name)])}
@@ -97,12 +87,42 @@ def extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
     return with_effects(model, added)
 
 
+def _listed(case: Case) -> tuple[str, ...]:
+    """What `use` names, none where it is "all"."""
+    use = case.effects.use
+    names = (use,) if isinstance(use, str) else tuple(use)
+    return () if use == "all" else names
+
+
+def _is_code(name: str) -> bool:
+    """Whether an entry of `use` is code of the user's own, `module:attribute`."""
+    return ":" in name
+
+
+def _chosen(case: Case, sites: Sites, arguments: Mapping[str, Any], say: Say) -> list[str | Effect]:
+    """What a list of candidates names, without the families that are not allowed, unless there is nothing else."""
+    chosen: list[str | Effect] = []
+    idle: list[str | Effect] = []
+    for name in _listed(case):
+        if _is_code(name):
+            chosen += _own_effects(name, case)
+        elif name in FAMILIES:
+            found = instances(name, sites, arguments)
+            chosen += found
+            idle += [] if found else [name]
+        else:
+            chosen.append(name)
+    if idle and chosen:
+        say(f"note: left out, since neither model nor data allow them: {', '.join(map(str, idle))}")
+    return chosen or idle
+
+
 def _axis(case: Case, arguments: Mapping[str, Any]) -> str | None:
     """The cluster when it is an axis of the model, not a column of the data."""
     return None if case.data.cluster in arguments else case.data.cluster
 
 
-def _own_effects(name: str, case: Case) -> list[str | Effect]:
+def _own_effects(name: str, case: Case) -> list[Effect]:
     found = load_object(name, case.folder)
     entries = [found] if isinstance(found, Effect) else found
     if not isinstance(entries, list | tuple) or not all(isinstance(entry, Effect) for entry in entries):
