@@ -119,6 +119,12 @@ class EffectsSection:
     exclude: tuple[str, ...] = ()
     known: tuple[str, ...] = ()
 
+    @property
+    def listed(self) -> tuple[str, ...]:
+        """What `use` names; nothing where it is "all"."""
+        names = (self.use,) if isinstance(self.use, str) else self.use
+        return () if self.use == "all" else names
+
 
 @dataclass(frozen=True, kw_only=True)
 class DiagnosisSection:
@@ -199,9 +205,7 @@ class Case:
     @property
     def user_code(self) -> tuple[str, ...]:
         """The user's own functions that this case runs, as "module:name"."""
-        use = self.effects.use
-        named = [self.model.name, *((use,) if isinstance(use, str) else use)]
-        return tuple(name for name in named if ":" in name)
+        return tuple(name for name in (self.model.name, *self.effects.listed) if ":" in name)
 
 
 _SECTIONS: dict[str, type] = {

@@ -24,7 +24,7 @@ def check_families(case: Case) -> None:
     Raises:
         InputError: there is one.
     """
-    for name in _listed(case):
+    for name in case.effects.listed:
         if not _is_code(name):
             family_of(name, f"{case.path.name} [effects] use")
 
@@ -68,7 +68,7 @@ def extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
         return model
     where = f"{case.path.name} [effects] known"
     sites = declare(model, arguments, cluster=_axis(case, arguments)).sites
-    named = {e.name: e for code in _listed(case) if _is_code(code) for e in _own_effects(code, case)}
+    named = {e.name: e for code in case.effects.listed if _is_code(code) for e in _own_effects(code, case)}
     added: list[Effect] = []
     for name in case.effects.known:
         offered = {e.name: e for e in catalogue(sites, arguments, [named.get(name, name)])}
@@ -87,13 +87,6 @@ def extended(case: Case, model: Model, arguments: Mapping[str, Any]) -> Model:
     return with_effects(model, added)
 
 
-def _listed(case: Case) -> tuple[str, ...]:
-    """What `use` names, none where it is "all"."""
-    use = case.effects.use
-    names = (use,) if isinstance(use, str) else tuple(use)
-    return () if use == "all" else names
-
-
 def _is_code(name: str) -> bool:
     """Whether an entry of `use` is code of the user's own, `module:attribute`."""
     return ":" in name
@@ -103,7 +96,7 @@ def _chosen(case: Case, sites: Sites, arguments: Mapping[str, Any], say: Say) ->
     """What a list of candidates names, without the families that are not allowed, unless there is nothing else."""
     chosen: list[str | Effect] = []
     idle: list[str | Effect] = []
-    for name in _listed(case):
+    for name in case.effects.listed:
         if _is_code(name):
             chosen += _own_effects(name, case)
         elif name in FAMILIES:
