@@ -12,14 +12,14 @@ from typing import Final, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 from scipy import stats
 
 from dtprob.models.prediction_powered.arrays import Values
 from dtprob.models.prediction_powered.covariance import spread
 from dtprob.models.prediction_powered.moments import Evaluation, Group
 from dtprob.models.prediction_powered.schemes import Mix
-from dtprob.models.prediction_powered.tuning import CAREFUL, Practice, fixed, tune
+from dtprob.models.prediction_powered.tuning import CAREFUL, Practice, fixed, tune, tuning_cost
 from dtprob.physical.labels import QUALITIES, LabelStudy, Quality, Setting, label_study
 from dtprob.reproduce.figure import Figure, Panel, Quantity, Series
 from dtprob.reproduce.progress import Progress
@@ -131,7 +131,8 @@ def _runs(
         evaluation = evaluation_of(label_study(own, shape._replace(unlabelled=count)), count)
         tuned = tune(evaluation, jnp.ones((1, 1)), "overall", practice)
         lams = [fixed(0.0, evaluation).value, fixed(1.0, evaluation).value, tuned.value]
-        rows = [_estimate(evaluation, lam, practice) for lam in lams]
+        costs = 0, 0, tuning_cost(tuned.value, "overall") if practice.lost is None else 0
+        rows = [_estimate(evaluation, lam, practice, cost) for lam, cost in zip(lams, costs, strict=True)]
         point, error, degrees = (jnp.stack(column) for column in zip(*rows, strict=True))
         return point, error, degrees, jnp.stack([lam[0, 0] for lam in lams])
 
@@ -157,11 +158,13 @@ def evaluation_of(study: LabelStudy, count: Float[Array, ""]) -> Evaluation:
     )
 
 
-def _estimate(evaluation: Evaluation, lam: Values, practice: Practice) -> tuple[Values, Values, Values]:
+def _estimate(
+    evaluation: Evaluation, lam: Values, practice: Practice, cost: Int[Values, ""] | int
+) -> tuple[Values, Values, Values]:
     """Estimate, standard error and degrees of freedom."""
     correction = evaluation.unlabelled.gradient[0] - evaluation.predicted.gradient[0]
     point = -(evaluation.labelled.gradient[0] + lam[0] * correction)
-    found = spread(evaluation, Mix(jnp.ones(()), lam, lam), jnp.ones((1, 1)), practice)
+    found = spread(evaluation, Mix(jnp.ones(()), lam, lam), jnp.ones((1, 1)), practice, cost)
     return point[0], jnp.sqrt(found.covariance[0, 0]), found.degrees[0]
 
 

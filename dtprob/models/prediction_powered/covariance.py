@@ -2,7 +2,7 @@
 
 from typing import NamedTuple
 
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from dtprob.models.prediction_powered.arrays import Values, compiled_for_jax, namespace
 from dtprob.models.prediction_powered.losses import AbstractLoss
@@ -57,7 +57,7 @@ def spread(
     mix: Mix,
     inverse: Float[Values, "parameter parameter"],
     practice: Practice,
-    tuned: int = 0,
+    tuned: Int[Values, ""] | int = 0,
 ) -> Spread:
     """The sandwich covariance of an estimate.
 
@@ -66,7 +66,8 @@ def spread(
         mix: the weights of the corrected loss; the last two entries per parameter and context.
         inverse: inverse of the mean second derivative.
         practice: conventions.
-        tuned: degrees of freedom lost beside those of the parameters, to lambdas that were tuned on the labels.
+        tuned: degrees of freedom lost beside those of the parameters, to lambdas that were tuned on the labels
+            (`tuning_cost`).
     """
     xp = namespace(evaluation.gradient)
     n, count, d = evaluation.n, evaluation.n_unlabelled, len(inverse)

@@ -9,7 +9,7 @@ from typing import Final, final, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy import special
 
 from dtprob.errors import InputError, unknown_name
@@ -22,7 +22,7 @@ from dtprob.models.prediction_powered.result import Estimate
 from dtprob.models.prediction_powered.sample import Sample
 from dtprob.models.prediction_powered.schemes import Mix, Scheme, named_scheme
 from dtprob.models.prediction_powered.solve import minimise
-from dtprob.models.prediction_powered.tuning import CAREFUL, By, Lambda, Practice, fixed, tune
+from dtprob.models.prediction_powered.tuning import CAREFUL, By, Lambda, Practice, fixed, tune, tuning_cost
 
 NO_UNLABELLED: Final = "There are no unlabelled samples with predictions, so this is plain ERM."
 BIASED: Final = "The interval does not cover the bias of the predictor."
@@ -86,10 +86,11 @@ def _few(loss: str | AbstractLoss | Quantile, sample: Sample, scheme: Scheme, by
                 f"Only {beyond:.1f} labels are expected beyond the quantile {loss.level:g}, so that the interval may be "
                 f"too narrow. Give more labels, or ask for a quantile nearer to the median."
             )
-    if sample.weight is not None and number < _FEWEST_EFFECTIVE:
-        yield (
-            f"The weights leave {number:.0f} effective labels of {sample.n}, so that the interval may be too narrow."
+    if number < _FEWEST_EFFECTIVE and (sample.weight is not None or not isinstance(loss, Quantile)):
+        left = (
+            f"{sample.n} labels" if sample.weight is None else f"{number:.0f} effective labels of {sample.n}"
         )
+        yield f"With {left} the interval may be too narrow, unless errors are nearly normal."
     if by == "context" and scheme.is_tuned:
         poor = np.flatnonzero(np.bincount(sample.labelled_context) < _FEWEST_PER_CONTEXT)
         if len(poor):
@@ -125,7 +126,7 @@ def _estimate(problem: _Problem, by: By, level: float) -> Estimate:
         theta = problem.solve(lam, theta, evaluation)
         evaluation = problem.at(theta)
         inverse = inverse if problem.is_translation else problem.inverse(evaluation, lam)
-    found = spread(evaluation, problem.mixes(lam.value), inverse, practice, problem.tuned(by))
+    found = spread(evaluation, problem.mixes(lam.value), inverse, practice, problem.cost(lam, by))
     alone = spread(evaluation, problem.labels_alone(lam), inverse, practice)
     covariance, degrees = np.asarray(found.covariance), np.asarray(found.degrees)
     chance = (1 + level) / 2
@@ -232,10 +233,10 @@ class _Problem:
         weighted = self.sample.weight is not None or self.sample.weight_unlabelled is not None
         return self.loss.traits.translation and not weighted
 
-    def tuned(self, by: By) -> int:
-        """Degrees of freedom that the tuned lambdas cost: one for each beyond the first, none where `lost` is given."""
-        counts = by == "context" and self.rounds > 0 and self.practice.lost is None
-        return self.sample.n_context - 1 if counts else 0
+    def cost(self, lam: Lambda, by: By) -> Int[Values, ""] | int:
+        """Degrees of freedom that the tuned lambdas cost, none where `lost` is given."""
+        counts = self.rounds > 0 and self.practice.lost is None
+        return tuning_cost(lam.value, by) if counts else 0
 
     def at(self, theta: Float[Values, " parameter"]) -> Evaluation:
         return self.start if self.is_translation else evaluate(self.loss, self.sample, theta)

@@ -36,7 +36,7 @@ class Practice:
         pooled_spread: estimate the spread of f and f~ from both together, as if they had one distribution;
             otherwise each from its own samples.
         lost: degrees of freedom that the labelled samples lose; None counts the parameters, and
-            the lambdas of contexts beyond the first.
+            two for each tuned lambda (`tuning_cost`).
         form: "loss" minimises the corrected loss; "estimates" corrects the minimiser instead: labels' own
             plus lambda times (that of unlabelled predictions minus that of labelled ones), as PPBoot does.
         reference: "t" compares with Student's t with Welch's degrees of freedom, "normal" with the normal.
@@ -83,6 +83,17 @@ def fixed(lam: float, evaluation: Evaluation) -> Lambda:
     shape = evaluation.gradient.shape[1], evaluation.unlabelled.value.shape[0]
     xp = namespace(evaluation.gradient)
     return Lambda(xp.full(shape, lam), xp.full(shape, lam), xp.zeros(shape))
+
+
+def tuning_cost(lam: Float[Values, "parameter context"], by: By) -> Values:
+    """Degrees of freedom that tuned lambdas cost: two for each that lies inside of [0, 1].
+
+    Regression of labels on predictions, whose slope lambda is, takes one of the residuals and, by its error, as much
+    as another of the estimate (Cochran, Sampling Techniques, 1977, section 7.9). A lambda at 0 or 1 was not fitted.
+    """
+    inside = (lam > 0) & (lam < 1)
+    counts = inside.sum(axis=1) if by == "context" else inside.any(axis=1)
+    return namespace(lam).asarray(2 * counts.max())
 
 
 @compiled_for_jax

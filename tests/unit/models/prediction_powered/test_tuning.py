@@ -9,7 +9,7 @@ from scipy import stats
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.estimate import estimate
 from dtprob.models.prediction_powered.sample import Sample
-from dtprob.models.prediction_powered.tuning import Practice, tune
+from dtprob.models.prediction_powered.tuning import Practice, tune, tuning_cost
 from dtprob.physical.labels import QUALITIES, Setting, label_study
 from dtprob.reproduce.label_grid import evaluation_of
 from tests.unit.models.prediction_powered.examples import linear, scalar
@@ -130,13 +130,33 @@ def by_context(random, n, contexts):
 def test_lambdas_of_contexts_cost_degrees_of_freedom():
     sample = by_context(np.random.default_rng(6), 60, 10)
     found = estimate("mean", sample, "tuned_ppi", by="context")
-    expected = estimate("mean", sample, "tuned_ppi", by="context", practice=Practice(lost=10))
+    lost = 1 + 2 * np.sum((found.lam.value[0] > 0) & (found.lam.value[0] < 1))
+    expected = estimate("mean", sample, "tuned_ppi", by="context", practice=Practice(lost=lost))
     for name in ("theta", "covariance", "low", "high"):
         np.testing.assert_allclose(getattr(found, name), getattr(expected, name), rtol=1e-12)
     (note,) = found.notes
     assert note.startswith("Fewer than 20 labels in contexts 0, 1, 2, 3, 4, 5, 6, 7, 8, 9, so that")
     many = by_context(np.random.default_rng(6), 600, 3)
     assert estimate("mean", many, "tuned_ppi", by="context").notes == ()
+
+
+@pytest.mark.parametrize("n", [5, 10])
+def test_intervals_cover_with_few_labels(n):
+    """Of 90%, 2000 times, by an exact binomial bound against .9; predictions have correlation .5."""
+    random, covered = np.random.default_rng(8), 0
+    for _ in range(2000):
+        y = random.normal(size=n + 500)
+        guess = 0.5 * y + np.sqrt(0.75) * random.normal(size=n + 500)
+        found = estimate("mean", Sample(y=y[:n], prediction=guess[:n], prediction_unlabelled=guess[n:]))
+        covered += found.low[0] <= 0 <= found.high[0]
+    assert covered >= stats.binom.ppf(1e-4, 2000, 0.9)
+
+
+@pytest.mark.parametrize("lam", [0.0, 1.0])
+def test_a_lambda_at_an_end_costs_nothing(lam):
+    assert tuning_cost(np.full((3, 1), lam), "overall") == 0
+    assert tuning_cost(np.full((3, 2), 0.5), "overall") == 2
+    assert tuning_cost(np.array([[0.5, lam, 0.3]]), "context") == 4
 
 
 @pytest.mark.study
