@@ -108,7 +108,13 @@ def _interpret(arrays: Arrays, options: Mapping[str, Any], *, matlab: bool) -> D
     if names & set(CHANNEL_ARRAYS):
         _check_names(arrays, _CANONICAL)
         return _channels(arrays, matlab=matlab)
-    return Table(_columns(arrays, matlab=matlab))
+    try:
+        return Table(_columns(arrays, matlab=matlab))
+    except InputError as error:
+        is_missing = error.expected == "finite numbers"
+        hint = "; or if these are labels, name them y and the features x_0, x_1, ..." if is_missing else ""
+        remedy = f"{error.remedy}{hint}"
+        raise InputError(error.what, error.expected, error.got, remedy) from None
 
 
 def _check_names(arrays: Arrays, known: Collection[str], valid: Collection[str] = ()) -> None:

@@ -53,6 +53,14 @@ def _load(function: str) -> Callable[..., Any]:
     return getattr(importlib.import_module(module), name)
 
 
+NAMES: Mapping[type, str] = {
+    ChannelData: "channel, subcarrier_frequency, rx_position, tx_position",
+    PowerData: "power, rx_position, tx_position",
+    NetworkLog: "episode, slot, buffer_0, action_0, ack_0, arrival_0, ...",
+    Labels: "x_0, x_1, ..., y and, if there is one, prediction",
+}
+"""What arrays of each kind are called in a file, for a user who calls them otherwise."""
+
 MODELS: Mapping[str, Entry] = {
     "phase_error_channel": Entry("dtprob.models.channel:phase_error_channel", ChannelData),
     "ray_traced_channel": Entry("dtprob.models.channel:ray_traced_channel", ChannelData),

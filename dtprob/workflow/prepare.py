@@ -24,7 +24,7 @@ from dtprob.models.arguments import Model, taking
 from dtprob.usercode import load_object, source_files
 from dtprob.workflow.candidates import Say, candidates, check_families, extended
 from dtprob.workflow.columns import check_columns
-from dtprob.workflow.models import MODELS
+from dtprob.workflow.models import MODELS, NAMES
 from dtprob.workflow.scene import reached, scene_files
 from dtprob.workflow.words import check_words, coded
 
@@ -248,7 +248,7 @@ def _expected(data: Data, kind: type, file: Path, case: Case) -> Data:
         return data
     names = ", ".join(list(data.arrays())[:6])
     got = f"{type(data).__name__} ({names})"
-    hint = " under their canonical names" if isinstance(data, Table) else ""
+    hint = f", under the names {NAMES[kind]}" if isinstance(data, Table) else ""
     remedy = f"Give {case.model.name} its kind of data{hint}"
     raise InputError(file.name, kind.__name__, got, remedy)
 

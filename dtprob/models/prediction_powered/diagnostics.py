@@ -161,7 +161,8 @@ def bias_map(
     )
     scale, scale_p = _slope(sample.prediction, sample.y, level)
     count = 20 * len(places) if x is None else 0
-    shift, feature = _shift(places, _drawn(sample.x_unlabelled, count, sample.rows_per_chunk))
+    other = _drawn(sample.x_unlabelled, count, sample.rows_per_chunk)
+    shift, feature = (1.0, 0) if other is None else feature_shift(places, other)
     return BiasMap(
         regions=tuple(
             _with_p_value(found[i], min(1.0, float(p))) for i, p in zip(order, corrected, strict=True)
@@ -255,9 +256,13 @@ def _drawn(array: Any, count: int, rows: int) -> np.ndarray | None:
     return np.concatenate([np.asarray(array[i : i + rows])[chosen[i : i + rows]] for i in starts])
 
 
-def _shift(places: np.ndarray, other: np.ndarray | None) -> tuple[float, int]:
-    if other is None:
-        return 1.0, 0
+def feature_shift(
+    places: Float[np.ndarray, "sample feature"], other: Float[np.ndarray, "other feature"]
+) -> tuple[float, int]:
+    """P-value of two groups having one distribution of each feature, and the feature that speaks most against it.
+
+    Kolmogorov-Smirnov, corrected for the number of features (Bonferroni).
+    """
     tests: list[float] = []
     for own, others in zip(places.T, other.T, strict=True):
         result: Any = stats.ks_2samp(own, others)

@@ -10,7 +10,7 @@ from jaxtyping import Float, Int
 
 from dtprob.data import Labels
 from dtprob.errors import InputError, unknown_name
-from dtprob.models.prediction_powered.diagnostics import BiasMap, Region, bias_map, worth
+from dtprob.models.prediction_powered.diagnostics import BiasMap, Region, bias_map, feature_shift, worth
 from dtprob.models.prediction_powered.estimate import Estimate, check_labels, estimate
 from dtprob.models.prediction_powered.generalised import Calibration, posterior_data
 from dtprob.models.prediction_powered.losses import named_loss
@@ -23,6 +23,8 @@ PREDICTORS: Final[dict[str, JaxPredictor]] = {"ridge": Ridge(), "neighbours": Ne
 """What can be trained where the file has no predictions."""
 
 _SHOWN: Final = 3
+_CHANCE: Final = 0.01
+"""P-value below which labelled rows are said to be drawn otherwise than the rest."""
 
 
 def label_data(
@@ -87,7 +89,7 @@ def label_data(
             probability=loss == "logistic",
         )
     found = estimate(chosen, sample, scheme, by=by, level=level)
-    for sentence in (*_worth(found), *_biases(data, sample)):
+    for sentence in (*_worth(found), *_shifts(data), *_biases(data, sample)):
         warnings.warn(sentence, stacklevel=2)
     return posterior_data(chosen, sample, found, calibration=calibration)
 
@@ -95,8 +97,8 @@ def label_data(
 def _worth(found: Estimate) -> Generator[str]:
     """What the predictions brought, in words; nothing where there are none."""
     told = worth(found)
-    if found.scheme.name != "erm" and found.n_unlabelled and not told.warnings:
-        yield f"The predictions are worth {told.labels_gained:.0f} labels beside {found.n}, lambda {told.lam.value:.2f}."
+    if found.scheme.name != "erm" and found.n_unlabelled and len(told.warnings) == len(found.notes):
+        yield f"The predictions are worth {told.labels_gained:.0f} labels beside {found.n}, lambda {told.lam.value:.3g}."
     yield from told.warnings
 
 
@@ -110,6 +112,24 @@ def _split(
     return own | other if len(rest) else own
 
 
+def _shifts(data: Labels) -> Generator[str]:
+    """Whether labelled rows are drawn as the others are, in words; weights may even out what they are not."""
+    if data.labelled.all() or data.weight is not None:
+        return
+    names = [f"x_{number}" for number in range(data.x.shape[1])]
+    columns = data.x
+    if data.prediction is not None:
+        names, columns = [*names, "prediction"], np.column_stack([columns, data.prediction])
+    if not names:
+        return
+    p_value, feature = feature_shift(columns[data.labelled], columns[~data.labelled])
+    if p_value < _CHANCE:
+        yield (
+            f"Labelled rows are not drawn as the others are: they differ in {names[feature]}, p = {p_value:.1g}. The "
+            "estimate may be biased and its interval too narrow. Label rows at random, or add a column weight."
+        )
+
+
 def _biases(data: Labels, sample: Sample) -> Generator[str]:
     """Where the predictor is wrong, in words."""
     if sample.prediction is None or data.x.shape[1] == 0 or sample.n != data.labelled.sum():
@@ -120,7 +140,7 @@ def _biases(data: Labels, sample: Sample) -> Generator[str]:
         yield f"Labels differ from predictions by {size} {_where(region)}, p = {region.p_value:.1g}."
     if _is_off(found):
         low, high = found.scale.low, found.scale.high
-        yield f"Labels go with {found.scale.value:.2f} ({low:.2f} to {high:.2f}) times the predictions."
+        yield f"Labels go with {found.scale.value:.3g} ({low:.3g} to {high:.3g}) times the predictions."
 
 
 def _is_off(found: BiasMap) -> bool:

@@ -234,6 +234,14 @@ def test_other_columns_are_a_table(tmp_path):
     assert read_table(save(tmp_path / "c.npz", channel_arrays())).columns["repeat"].tolist() == [0, 0, 1, 1]
 
 
+def test_labels_of_other_names_are_told_theirs(tmp_path):
+    path = save(tmp_path / "survey.csv", {"distance": [1.0, 2.0], "level": [-80.0, np.nan]})
+    with pytest.raises(
+        InputError, match=r"level: .*got NaN at index 1.*or if these are labels, name them y and"
+    ):
+        read(path)
+
+
 def test_arrays_are_read_only_and_the_given_ones_stay_writable():
     arrays = channel_arrays()
     data = ChannelData(**arrays)

@@ -1,6 +1,7 @@
 """A CASE with labels: the example's file fitted, what its user is told, and what is refused."""
 
 import json
+import re
 import shutil
 import warnings
 from pathlib import Path
@@ -72,6 +73,15 @@ def test_an_option_that_does_not_exist_is_named(tmp_path):
         said(lambda: prepare(example(tmp_path, 'schema = "erm"'), need="fit"))
 
 
+def test_columns_of_other_names_are_told_theirs(tmp_path):
+    case = example(tmp_path)
+    (tmp_path / "rssi.csv").write_text("distance,level\n1,2\n2,3\n")
+    with pytest.raises(
+        InputError, match=r"got Table \(distance, level\).*under the names x_0, x_1, \.\.\., y"
+    ):
+        prepare(case, need="fit")
+
+
 @pytest.mark.parametrize("predictor", ["ridge", "neighbours"])
 def test_predictors_are_trained_where_the_file_has_none(predictor):
     found, _ = said(lambda: label_data(rows(predicted=False), loss="mean", predictor=predictor))
@@ -137,6 +147,31 @@ def test_weights_count_rows_as_often_as_they_say():
     np.testing.assert_allclose(found["center"], copied["center"], rtol=1e-9)
     plain = said(lambda: label_data(rows(), loss="ols", scheme="ppi"))[0]
     assert not np.allclose(found["center"], plain["center"], rtol=1e-3)
+
+
+def near(weight=None):
+    """Rows whose labels were collected at low x, where the predictor errs otherwise than elsewhere."""
+    random = np.random.default_rng(9)
+    x = random.uniform(0, 1, (1000, 1))
+    y = 2 * x[:, 0] ** 2 + 0.1 * random.standard_normal(1000)
+    labelled = np.arange(1000) < 60
+    x[labelled] **= 2
+    return Labels(x=x, y=np.where(labelled, y, 0.0), labelled=labelled, prediction=x[:, 0], weight=weight)
+
+
+def test_labels_that_are_drawn_otherwise_than_the_rest_are_told():
+    assert any("differ in x_0, p = " in text for text in said(lambda: label_data(near()))[1])
+    for data in (rows(), near(np.ones(1000))):
+        assert not any("not drawn" in text for text in said(lambda data=data: label_data(data))[1])
+
+
+def test_few_labels_hide_neither_the_worth_nor_small_scales():
+    data = rows(n=12)
+    data = Labels(x=data.x, y=1e-9 * data.y, labelled=data.labelled, prediction=data.prediction)
+    told = " ".join(said(lambda: label_data(data))[1])
+    assert "With 12 labels the interval" in told
+    assert re.search(r"are worth \d+ labels beside 12, lambda \S*e-", told)
+    assert re.search(r"go with \S*e-", told)
 
 
 def test_each_context_of_a_file_has_a_lambda():
