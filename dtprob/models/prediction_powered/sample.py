@@ -10,6 +10,17 @@ from jaxtyping import Array, Float, Int
 
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.arrays import Values
+from dtprob.models.prediction_powered.checks import (
+    check_columns,
+    check_mask,
+    check_predictors,
+    contexts,
+    finite,
+    matrix,
+    prediction_shape,
+    real,
+    weights,
+)
 
 _CHUNK_NUMBERS: Final = 16_000_000
 """Numbers in a chunk of unlabelled data, 128 MB in double precision."""
@@ -54,8 +65,9 @@ class Sample:
         chunk: rows of a chunk; by default about 128 MB.
 
     Raises:
-        InputError: shapes that do not fit together, more predictors than samples, NaN or infinity among labels,
-            features or predictions of labelled samples, negative weights.
+        InputError: shapes or columns that do not fit together, masked values, a single unlabelled sample, more
+            predictors than samples, NaN or infinity among labels, features or predictions of labelled samples,
+            negative weights.
     """
 
     y: np.ndarray
@@ -72,6 +84,19 @@ class Sample:
 
     def __post_init__(self) -> None:
         """Check everything that can be checked without a pass over the unlabelled data."""
+        for name in (
+            "y",
+            "x",
+            "prediction",
+            "x_unlabelled",
+            "prediction_unlabelled",
+            "weight",
+            "weight_unlabelled",
+        ):
+            check_mask(name, getattr(self, name))
+        check_columns(self.x, self.x_unlabelled)
+        if self.chunk is not None and self.chunk < 1:
+            raise InputError("chunk", "1 or more rows", str(self.chunk), "Leave it out for about 128 MB")
         for name in ("x_unlabelled", "prediction_unlabelled"):
             if isinstance(getattr(self, name), (list, tuple)):
                 self._set(name, np.asarray(getattr(self, name)))
@@ -79,18 +104,18 @@ class Sample:
         if labels.ndim not in (1, 2) or not len(labels):
             got = f"shape {labels.shape}"
             raise InputError("y", "labels, shape (n,) or (n, label)", got, "Give one row per labelled sample")
-        self._set("y", _finite("y", labels))
+        self._set("y", finite("y", labels))
         n = len(labels)
-        x = np.zeros((n, 0)) if self.x is None else _matrix("x", self.x, n)
-        self._set("x", _finite("x", x))
-        self._set("weight", _weights("weight", self.weight, n))
-        self._set("context", _contexts("context", self.context, n))
+        x = np.zeros((n, 0)) if self.x is None else matrix("x", self.x, n)
+        self._set("x", finite("x", x))
+        self._set("weight", weights("weight", self.weight, n))
+        self._set("context", contexts("context", self.context, n))
         if self.prediction is not None:
             prediction = np.asarray(self.prediction)
             if prediction.shape != labels.shape:
                 remedy = "Give one prediction per labelled sample"
                 raise InputError("prediction", f"shape {labels.shape}", str(prediction.shape), remedy)
-            self._set("prediction", _finite("prediction", prediction))
+            self._set("prediction", finite("prediction", prediction))
         self._check_unlabelled()
 
     def _set(self, name: str, value: Any) -> None:
@@ -98,12 +123,12 @@ class Sample:
 
     def _check_unlabelled(self) -> None:
         count = self.n_unlabelled
-        self._set("weight_unlabelled", _weights("weight_unlabelled", self.weight_unlabelled, count))
-        self._set("context_unlabelled", _contexts("context_unlabelled", self.context_unlabelled, count))
+        self._set("weight_unlabelled", weights("weight_unlabelled", self.weight_unlabelled, count))
+        self._set("context_unlabelled", contexts("context_unlabelled", self.context_unlabelled, count))
         if count == 0:
             return
         if self.x_unlabelled is not None:
-            _matrix("x_unlabelled", self.x_unlabelled, count, convert=False)
+            matrix("x_unlabelled", self.x_unlabelled, count, convert=False)
             width, expected = self.x_unlabelled.shape[1], self.features.shape[1]
             if width != expected:
                 got = f"width {width}"
@@ -113,12 +138,15 @@ class Sample:
             raise InputError("x_unlabelled", "features, as x has", "nothing", "Give x_unlabelled")
         if self.prediction_unlabelled is None:
             return
+        if count == 1:
+            remedy = "Give more, or leave it out: one sample does not tell how far predictions scatter"
+            raise InputError("prediction_unlabelled", "2 or more samples", "1", remedy)
         if self.prediction is None:
             remedy = "Predict the labelled samples too, each without its own label"
             raise InputError("prediction", "predictions of the labelled samples", "nothing", remedy)
         if not callable(self.prediction_unlabelled):
-            shape = _prediction_shape(self.prediction_unlabelled.shape, count, self.y.shape[1:])
-            _check_predictors(shape[1], count, self.n)
+            shape = prediction_shape(self.prediction_unlabelled.shape, count, self.y.shape[1:])
+            check_predictors(shape[1], count, self.n)
         highest = -1 if self.context_unlabelled is None else int(self.context_unlabelled.max())
         if highest >= self.n_context:
             got = f"context {highest}"
@@ -208,11 +236,11 @@ class Sample:
             x = np.zeros((size, 0)) if self.x_unlabelled is None else np.asarray(self.x_unlabelled[here])
             given = self.prediction_unlabelled
             told = np.asarray(given(x) if callable(given) else given[here])
-            prediction = _real("prediction_unlabelled", told)
+            prediction = real("prediction_unlabelled", told)
             weight, context = self.weight_unlabelled, self.context_unlabelled
             yield Chunk(
-                _real("x_unlabelled", x),
-                prediction.reshape(_prediction_shape(prediction.shape, size, self.y.shape[1:])),
+                real("x_unlabelled", x),
+                prediction.reshape(prediction_shape(prediction.shape, size, self.y.shape[1:])),
                 ones[:size] if weight is None else weight[here],
                 zeros[:size] if context is None else context[here],
             )
@@ -242,75 +270,3 @@ def _filled(chunk: Chunk, size: int) -> Chunk:
 
     weight = jnp.pad(jnp.asarray(chunk.weight), (0, short))
     return Chunk(*(filled(part) for part in chunk))._replace(weight=weight)
-
-
-def _prediction_shape(shape: tuple[int, ...], count: int, label: tuple[int, ...]) -> tuple[int, ...]:
-    """The shape (sample, fold, *label) of given predictions."""
-    if shape == (count, *label):
-        return count, 1, *label
-    if len(shape) == 2 + len(label) and shape[0] == count and shape[2:] == label:
-        return shape
-    expected = f"shape {(count, *label)}, or a further axis of predictors after the first"
-    raise InputError("prediction_unlabelled", expected, str(shape), "Give a prediction per unlabelled sample")
-
-
-def _check_predictors(predictors: int, count: int, n: int) -> None:
-    """Refuse more predictors than one could train: axes in the wrong order would pass for samples without spread."""
-    if predictors > 1 and predictors > min(count, n):
-        expected = f"axes (sample, predictor), of {n} labels no more than {n} predictors"
-        got = f"{predictors} predictors of {count} samples"
-        raise InputError("prediction_unlabelled", expected, got, "Transpose it")
-
-
-def _real(name: str, array: np.ndarray) -> np.ndarray:
-    """As numbers with a fraction, so that a mean of whole numbers or of yes and no is right."""
-    if array.dtype.kind not in "fiub":
-        raise InputError(name, "real numbers", f"values of type {array.dtype}", f"Give {name} as numbers")
-    return array.astype(np.result_type(array.dtype, np.float32), copy=False)
-
-
-def _finite(name: str, array: np.ndarray) -> np.ndarray:
-    array = _real(name, array)
-    bad = ~np.isfinite(array)
-    if bad.any():
-        place = tuple(int(i) for i in np.argwhere(bad)[0])
-        shown = place[0] if len(place) == 1 else place
-        got = f"{array[place]} at index {shown}"
-        remedy = "Move samples without a label to the unlabelled ones" if name == "y" else "Remove the sample"
-        raise InputError(name, "finite numbers", got, remedy)
-    return array
-
-
-def _matrix(name: str, value: Any, count: int, *, convert: bool = True) -> Any:
-    array = np.asarray(value) if convert else value
-    if len(array.shape) != 2 or array.shape[0] != count:
-        got = f"shape {tuple(array.shape)}"
-        raise InputError(name, f"shape ({count}, feature)", got, "Give one row per sample")
-    return array
-
-
-def _weights(name: str, value: Any, count: int) -> np.ndarray | None:
-    if value is None:
-        return None
-    weight = np.asarray(value, float)
-    if weight.shape != (count,):
-        raise InputError(name, f"shape ({count},)", str(weight.shape), "Give one weight per sample")
-    bad = ~(weight >= 0) | ~np.isfinite(weight)
-    if bad.any():
-        first = int(np.argmax(bad))
-        got = f"{weight[first]:g} at index {first}"
-        raise InputError(name, "weights from 0 up", got, "Give the weight of a sample, not its difference")
-    if not weight.sum() > 0:
-        raise InputError(name, "a weight above 0", "zeros only", "Give the samples that count a weight")
-    return weight / weight.mean()
-
-
-def _contexts(name: str, value: Any, count: int) -> np.ndarray | None:
-    if value is None:
-        return None
-    context = np.asarray(value)
-    if context.shape != (count,) or context.dtype.kind not in "iu" or (count and context.min() < 0):
-        got = f"shape {context.shape}, type {context.dtype}"
-        remedy = "Number the contexts from 0"
-        raise InputError(name, f"shape ({count},), whole numbers from 0", got, remedy)
-    return context

@@ -68,8 +68,8 @@ def train(
     """
     chosen = named_scheme(scheme)
     whole = {"features": features, "x_unlabelled": features_unlabelled, **rest}
-    x, y = np.asarray(x), np.asarray(y)
     Sample(x=x, y=y, x_unlabelled=x_unlabelled, prediction_unlabelled=None)
+    x, y = np.asarray(x), np.asarray(y)
     empty = x_unlabelled is None or len(x_unlabelled) == 0
     if chosen.training == "none" or empty:
         return _sample(whole, np.arange(len(y)), y, None, None)

@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pandas as pd
 import pytest
 
 from dtprob.errors import InputError
@@ -40,6 +41,27 @@ SAMPLES = {
         "of 6 labels no more than 6 predictors, got 7 predictors of 40 samples",
     ),
     "no own predictions": ({"y": Y, "prediction_unlabelled": Y}, "prediction: expected predictions of the"),
+    "masked label": (
+        {"y": np.ma.masked_array(Y, mask=Y > 3)},
+        "y: expected values that are there, got a masked one in row 4. Move samples without",
+    ),
+    "masked predictions": (
+        {"y": Y, "prediction": Y, "prediction_unlabelled": np.ma.masked_array(Y, mask=Y > 3)},
+        "prediction_unlabelled: expected values that are there, got a masked one in row 4. Remove",
+    ),
+    "columns in another order": (
+        {
+            "y": Y,
+            "x": pd.DataFrame(X, columns=["a", "b"]),
+            "x_unlabelled": pd.DataFrame(X, columns=["b", "a"]),
+        },
+        r"x_unlabelled: expected columns \['a', 'b'\], as x has, got \['b', 'a'\]",
+    ),
+    "one unlabelled sample": (
+        {"y": Y, "prediction": Y, "prediction_unlabelled": Y[:1]},
+        "prediction_unlabelled: expected 2 or more samples, got 1. Give more, or leave it out",
+    ),
+    "empty chunks": ({"y": Y, "chunk": 0}, "chunk: expected 1 or more rows, got 0"),
     "negative weight": ({"y": Y, "weight": -Y}, r"weight: expected weights from 0 up, got -1 at index 1"),
     "no weight": ({"y": Y, "weight": 0 * Y}, "weight: expected a weight above 0"),
     "context": ({"y": Y, "context": Y}, "context: expected shape"),
@@ -114,6 +136,10 @@ CALLS = {
     "few labels": (
         lambda: train(KEY, "cppi", Ridge(), x=X, y=Y, x_unlabelled=X, folds=7),
         r"labelled samples: expected at least one per fold \(7\), got 6\. Use 6 folds",
+    ),
+    "masked label of a training": (
+        lambda: train(KEY, "cppi", Ridge(), x=X, y=np.ma.masked_array(Y, mask=Y > 3), x_unlabelled=X),
+        "y: expected values that are there, got a masked one in row 4",
     ),
     "one fold": (
         lambda: train(KEY, "cppi", Ridge(), x=X, y=Y, x_unlabelled=X, folds=1),
