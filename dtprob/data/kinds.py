@@ -54,6 +54,7 @@ LABEL_ARRAYS: Mapping[str, ArraySpec] = {
     "prediction": ArraySpec((("sample",),)),
     "weight": ArraySpec((("sample",),), lower=0.0),
     "context": ArraySpec((("sample",),), "integer", lower=0),
+    "cluster": ArraySpec((("sample",),), "integer"),
 }
 
 
@@ -197,6 +198,7 @@ class Labels(_Checked):
         prediction: the predictor's label.
         weight: how much a sample counts in what is estimated.
         context: which context a sample belongs to, 0, 1, ...
+        cluster: which samples may depend on each other, such as those of a route; any whole number.
 
     Raises:
         InputError: arrays that do not fit together, NaN or infinity, a weight or context below 0, no label at
@@ -209,6 +211,7 @@ class Labels(_Checked):
     prediction: Float[np.ndarray, " sample"] | None = None
     weight: Float[np.ndarray, " sample"] | None = None
     context: Int[np.ndarray, " sample"] | None = None
+    cluster: Int[np.ndarray, " sample"] | None = None
 
     def __post_init__(self) -> None:
         self._check(LABEL_ARRAYS)

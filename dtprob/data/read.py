@@ -202,7 +202,7 @@ def _labels(arrays: Arrays, *, matlab: bool) -> Labels:
             )
         columns = {name: arrays.pop(name) for name in numbered}
         arrays["x"] = side_by_side(_columns(columns, matlab=matlab))
-    optional = ("prediction", "weight", "context")
+    optional = ("prediction", "weight", "context", "cluster")
     for name in arrays:
         if name not in {"x", "y", *optional}:
             raise unknown_name("array", name, ["x", "y", *optional], "array name")

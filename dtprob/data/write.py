@@ -64,7 +64,8 @@ def file_arrays(data: Data) -> dict[str, np.ndarray]:
     if isinstance(data, Labels):
         columns = {f"x_{i}": column for i, column in enumerate(data.x.T)}
         columns["y"] = np.where(data.labelled, data.y, np.nan)
-        others = {"prediction": data.prediction, "weight": data.weight, "context": data.context}
+        names = "prediction", "weight", "context", "cluster"
+        others = {name: getattr(data, name) for name in names}
         return columns | {name: values for name, values in others.items() if values is not None}
     return arrays
 

@@ -19,6 +19,7 @@ from scipy import linalg
 
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.arrays import Values
+from dtprob.models.prediction_powered.clusters import check_clusters
 from dtprob.models.prediction_powered.losses import AbstractLoss, named_loss
 from dtprob.models.prediction_powered.moments import (
     Derivatives,
@@ -70,6 +71,7 @@ def bootstrap(
     Raises:
         InputError: fewer than 2 draws, an unknown method.
     """
+    check_clusters(sample, pooled=False, what="the bootstrap")
     if draws < 2 or method not in ("percentile", "basic"):
         got = f"{draws} draws, method {method!r}"
         raise InputError("bootstrap", "2 or more draws, method percentile or basic", got, "Correct them")

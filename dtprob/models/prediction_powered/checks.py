@@ -97,3 +97,31 @@ def contexts(name: str, value: Any, count: int) -> np.ndarray | None:
         remedy = "Number the contexts from 0"
         raise InputError(name, f"shape ({count},), whole numbers from 0", got, remedy)
     return context
+
+
+def clusters(name: str, value: Any, count: int) -> np.ndarray | None:
+    """Numbers or names, one per sample."""
+    if value is None:
+        return None
+    cluster = np.asarray(value)
+    if cluster.dtype.kind == "O":
+        cluster = cluster.astype(str)
+    if cluster.shape != (count,) or cluster.dtype.kind not in "iuU":
+        got = f"shape {cluster.shape}, type {cluster.dtype}"
+        raise InputError(name, f"shape ({count},), whole numbers or names", got, "Name each sample's cluster")
+    return cluster
+
+
+def check_both(cluster: Any, other: Any, has_predictions: bool, n_context: int) -> None:
+    """See that clusters are told of all samples in one way, and that there are no contexts beside them."""
+    if cluster is None and other is None:
+        return
+    if cluster is None or (has_predictions and other is None):
+        missing = "cluster" if cluster is None else "cluster_unlabelled"
+        remedy = "Give both; a sample that depends on no other is a cluster of its own"
+        raise InputError(missing, "clusters of labelled and unlabelled samples", "none", remedy)
+    if other is not None and (cluster.dtype.kind == "U") != (other.dtype.kind == "U"):
+        got = f"{cluster.dtype} and {other.dtype}"
+        raise InputError("cluster_unlabelled", "names or numbers, as cluster has", got, "Name them alike")
+    if n_context > 1:
+        raise InputError("cluster", "one context", f"{n_context} contexts", "Give either of the two")

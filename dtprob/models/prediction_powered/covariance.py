@@ -79,9 +79,9 @@ def spread(
     effective = n if evaluation.weight is None else effective_number(evaluation.weight)
     labelled_degrees = xp.maximum(effective - lost - tuned, 1.0)
     labelled = influence.T @ influence * (effective / labelled_degrees) / n**2
-    untold = (n <= lost) & xp.eye(
-        d, dtype=bool
-    )  # a fit to as many labels as parameters leaves no error to look at
+    # a fit to as many labels as parameters leaves no error to look at
+    counted = n if evaluation.weight is None else (evaluation.weight > 0).sum()
+    untold = (counted <= lost) & xp.eye(d, dtype=bool)
     labelled = xp.where(untold, xp.inf, labelled)
     unlabelled_degrees = xp.maximum(count - min(lost, 1), 1.0)
     unlabelled = _unlabelled(evaluation, mix.unlabelled, inverse) / unlabelled_degrees

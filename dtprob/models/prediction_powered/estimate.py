@@ -14,6 +14,7 @@ from scipy import special
 
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.prediction_powered.arrays import Values, namespace
+from dtprob.models.prediction_powered.clusters import check_clusters, cluster_weights, clustered
 from dtprob.models.prediction_powered.covariance import effective_number, inverse_hessian, spread
 from dtprob.models.prediction_powered.losses import LOSSES, AbstractLoss, SmoothQuantile, named_loss
 from dtprob.models.prediction_powered.moments import Evaluation, evaluate
@@ -67,6 +68,8 @@ def estimate(
     elif chosen.pooled:
         notes = (BIASED,)
     _check_contexts(by, loss, sample, practice)
+    alone = "a quantile" if isinstance(loss, Quantile) else "pooled_spread" if practice.pooled_spread else ""
+    check_clusters(sample, pooled=chosen.pooled, what=alone)
     if isinstance(loss, Quantile):
         result = estimate_quantile(loss, sample, chosen, level=level, practice=practice)
     else:
@@ -78,7 +81,7 @@ def estimate(
 
 def _few(loss: str | AbstractLoss | Quantile, sample: Sample, scheme: Scheme, by: By) -> Iterator[str]:
     """Where so few labels tell the variance, a quantile or a lambda that the interval may be too narrow."""
-    number = float(effective_number(sample.labelled_weight))
+    number = float(effective_number(cluster_weights(sample)))
     if isinstance(loss, Quantile | SmoothQuantile):
         beyond = number * min(loss.level, 1 - loss.level)
         if beyond < _FEWEST_BEYOND:
@@ -90,6 +93,7 @@ def _few(loss: str | AbstractLoss | Quantile, sample: Sample, scheme: Scheme, by
         left = (
             f"{sample.n} labels" if sample.weight is None else f"{number:.0f} effective labels of {sample.n}"
         )
+        left = left if sample.cluster is None else f"{number:.0f} effective clusters of labels"
         yield f"With {left} the interval may be too narrow, unless errors are nearly normal."
     if by == "context" and scheme.is_tuned:
         poor = np.flatnonzero(np.bincount(sample.labelled_context) < _FEWEST_PER_CONTEXT)
@@ -186,7 +190,13 @@ def _problem(loss: AbstractLoss, sample: Sample, scheme: Scheme, practice: Pract
     theta = loss.start(xp.asarray(sample.features), xp.asarray(sample.y))
     if loss.traits.linear_in_label and not loss.traits.quadratic and sample.n_unlabelled > sample.n:
         theta = _labels_alone(loss, sample, theta)
-    return _Problem(loss, sample, scheme, practice, theta, evaluate(loss, sample, theta))
+    return _Problem(loss, sample, scheme, practice, theta, _evaluated(loss, sample, theta))
+
+
+def _evaluated(loss: AbstractLoss, sample: Sample, theta: Float[Values, " parameter"]) -> Evaluation:
+    """The data at theta, by clusters where there are any."""
+    found = evaluate(loss, sample, theta)
+    return found if sample.cluster is None else clustered(loss, sample, theta, found)
 
 
 def _labels_alone(
@@ -239,7 +249,7 @@ class _Problem:
         return tuning_cost(lam.value, by) if counts else 0
 
     def at(self, theta: Float[Values, " parameter"]) -> Evaluation:
-        return self.start if self.is_translation else evaluate(self.loss, self.sample, theta)
+        return self.start if self.is_translation else _evaluated(self.loss, self.sample, theta)
 
     def mixes(self, lam: Float[Values, "*parameter context"]) -> Mix:
         return self.scheme.mix(self.start.n, self.start.n_unlabelled, lam)

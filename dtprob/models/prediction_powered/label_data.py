@@ -71,7 +71,7 @@ def label_data(
     mine, rest = np.flatnonzero(data.labelled), np.flatnonzero(~data.labelled)
     design = np.column_stack([np.ones(len(data.x)), data.x]) if intercept else data.x
     features = None if loss == "mean" else design
-    given: dict[str, Any] = {"weight": data.weight, "context": data.context}
+    given: dict[str, Any] = {"weight": data.weight, "context": data.context, "cluster": data.cluster}
     y = data.y[mine]
     if not len(rest) or data.prediction is not None:
         given |= {"x": features, "prediction": data.prediction}
@@ -114,7 +114,7 @@ def _split(
 
 def _shifts(data: Labels) -> Generator[str]:
     """Whether labelled rows are drawn as the others are, in words; weights may even out what they are not."""
-    if data.labelled.all() or data.weight is not None:
+    if data.labelled.all() or data.weight is not None or data.cluster is not None:
         return
     names = [f"x_{number}" for number in range(data.x.shape[1])]
     columns = data.x
@@ -131,8 +131,13 @@ def _shifts(data: Labels) -> Generator[str]:
 
 
 def _biases(data: Labels, sample: Sample) -> Generator[str]:
-    """Where the predictor is wrong, in words."""
-    if sample.prediction is None or data.x.shape[1] == 0 or sample.n != data.labelled.sum():
+    """Where the predictor is wrong, in words; nothing of clusters, whose samples such tests would take one by one."""
+    if (
+        sample.prediction is None
+        or sample.cluster is not None
+        or data.x.shape[1] == 0
+        or sample.n != data.labelled.sum()
+    ):
         return
     found = bias_map(sample, data.x[data.labelled])
     for region in found.biased()[:_SHOWN]:

@@ -233,12 +233,12 @@ def _sums(
     x, prediction, weight, context = chunk
     if derivatives.linear_in_label:
         prediction = averaged(prediction)
-    values = _over_predictors(lambda y: derivatives.values(theta, x, y), prediction)
-    gradients = _over_predictors(lambda y: derivatives.gradients(theta, x, y), prediction)
+    values = over_predictors(lambda y: derivatives.values(theta, x, y), prediction)
+    gradients = over_predictors(lambda y: derivatives.gradients(theta, x, y), prediction)
 
     def of_context(masked: Any) -> Group:
         rows = masked[:, None] * gradients
-        hessian = _over_predictors(lambda y: derivatives.hessian(theta, x, y, masked), prediction)
+        hessian = over_predictors(lambda y: derivatives.hessian(theta, x, y, masked), prediction)
         squares = (masked @ rows, masked @ masked) if weighted else (None, None)
         return Group(masked @ values, masked @ gradients, hessian, rows.T @ rows, *squares)
 
@@ -248,7 +248,7 @@ def _sums(
     return each(of_context, masks)
 
 
-def _over_predictors(function: Callable[[Any], Any], prediction: Values) -> Any:
+def over_predictors(function: Callable[[Any], Any], prediction: Values) -> Any:
     """The mean over predictors of a function of the predicted labels."""
     if prediction.shape[1] == 1:
         return function(prediction[:, 0])

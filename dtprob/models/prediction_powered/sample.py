@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Any, Final, NamedTuple, final
 
 import jax.numpy as jnp
@@ -11,9 +12,11 @@ from jaxtyping import Array, Float, Int
 from dtprob.errors import InputError
 from dtprob.models.prediction_powered.arrays import Values
 from dtprob.models.prediction_powered.checks import (
+    check_both,
     check_columns,
     check_mask,
     check_predictors,
+    clusters,
     contexts,
     finite,
     matrix,
@@ -62,6 +65,9 @@ class Sample:
         context: for each labelled sample, which context it belongs to, 0, 1, ...; each context has a lambda
             of its own when tuning asks for it.
         context_unlabelled: likewise for the unlabelled samples.
+        cluster: for each labelled sample, to which cluster (a route, a sweep, a day) it belongs, a number or a name;
+            samples of one cluster may depend on each other, and the interval then counts clusters.
+        cluster_unlabelled: likewise for the unlabelled samples; the same name is the same cluster.
         chunk: rows of a chunk; by default about 128 MB.
 
     Raises:
@@ -79,6 +85,8 @@ class Sample:
     weight_unlabelled: np.ndarray | None = None
     context: np.ndarray | None = None
     context_unlabelled: np.ndarray | None = None
+    cluster: np.ndarray | None = None
+    cluster_unlabelled: np.ndarray | None = None
     chunk: int | None = None
     _whole: dict[str, Chunk] = field(default_factory=dict, init=False, repr=False)
 
@@ -110,6 +118,7 @@ class Sample:
         self._set("x", finite("x", x))
         self._set("weight", weights("weight", self.weight, n))
         self._set("context", contexts("context", self.context, n))
+        self._set("cluster", clusters("cluster", self.cluster, n))
         if self.prediction is not None:
             prediction = np.asarray(self.prediction)
             if prediction.shape != labels.shape:
@@ -125,6 +134,8 @@ class Sample:
         count = self.n_unlabelled
         self._set("weight_unlabelled", weights("weight_unlabelled", self.weight_unlabelled, count))
         self._set("context_unlabelled", contexts("context_unlabelled", self.context_unlabelled, count))
+        self._set("cluster_unlabelled", clusters("cluster_unlabelled", self.cluster_unlabelled, count))
+        check_both(self.cluster, self.cluster_unlabelled, self.has_predictions, self.n_context)
         if count == 0:
             return
         if self.x_unlabelled is not None:
@@ -190,6 +201,22 @@ class Sample:
     def labelled_context(self) -> np.ndarray:
         """Contexts of the labelled samples."""
         return np.zeros(self.n, int) if self.context is None else self.context
+
+    @cached_property
+    def clusters(self) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " N"]]:
+        """Clusters of labelled and unlabelled samples, numbered from 0; those with labels come first.
+
+        Each sample is its own where there are none.
+        """
+        if self.cluster is None:
+            return np.arange(self.n), np.arange(self.n, self.n + self.n_unlabelled)
+        names, own = np.unique(self.cluster, return_inverse=True)
+        if self.cluster_unlabelled is None:
+            return own, np.zeros(0, int)
+        others, rest = np.unique(self.cluster_unlabelled, return_inverse=True)
+        place = np.minimum(np.searchsorted(names, others), len(names) - 1)
+        known = names[place] == others
+        return own, np.where(known, place, len(names) - 1 + np.cumsum(~known))[rest]
 
     def chunks(self, *, averaged: bool = False) -> Generator[Chunk]:
         """The unlabelled samples as JAX's arrays, one chunk after another, all of one size.

@@ -60,7 +60,7 @@ def train(
         features: what the loss sees of the labelled samples; None where it needs no features.
         features_unlabelled: likewise of the unlabelled samples.
         probability: predict the probability of label 1 with predict_proba.
-        rest: further fields of `Sample`, such as weights.
+        rest: further fields of `Sample`, such as weights; a cluster is kept in one fold or half.
 
     Raises:
         InputError: fewer labels than folds, one label to split, a fold whose training labels are all of one class,
@@ -74,18 +74,25 @@ def train(
     if chosen.training == "none" or empty:
         return _sample(whole, np.arange(len(y)), y, None, None)
     keys = jax.random.split(key)
+    unit = (
+        np.arange(len(y))
+        if rest.get("cluster") is None
+        else np.unique(rest["cluster"], return_inverse=True)[1]
+    )
+    units = 1 + int(unit.max())
     if chosen.training == "split":
-        if len(y) < 2:
+        if units < 2:
             remedy = "Label more samples, or use scheme erm"
-            raise InputError("labelled samples", "2 or more, half of which train", str(len(y)), remedy)
-        half = np.asarray(jax.random.permutation(keys[0], len(y)))
-        inside = np.zeros(len(y), bool)
-        inside[half[: len(y) // 2]] = True
+            raise InputError("labelled samples", "2 or more, half of which train", str(units), remedy)
+        half = np.asarray(jax.random.permutation(keys[0], units))
+        chosen_units = np.zeros(units, bool)
+        chosen_units[half[: units // 2]] = True
+        inside = chosen_units[unit]
         masks, kept = inside[None], np.flatnonzero(~inside)
     elif chosen.training == "all":
         masks, kept = np.ones((1, len(y)), bool), np.arange(len(y))
     else:
-        fold = assign_folds(keys[0], len(y), folds)
+        fold = assign_folds(keys[0], units, folds)[unit]
         masks, kept = fold != np.arange(folds)[:, None], np.arange(len(y))
     _check_classes(y, masks, probability=probability)
     asked = _trained(keys[1], predictor, x, y, masks, probability=probability)
@@ -103,7 +110,7 @@ def _sample(
     whole: dict[str, Any], kept: np.ndarray, y: np.ndarray, prediction: Any, unlabelled: Any
 ) -> Sample:
     features, rest = whole["features"], {k: v for k, v in whole.items() if k != "features"}
-    for name in ("weight", "context"):
+    for name in ("weight", "context", "cluster"):
         if rest.get(name) is not None:
             rest[name] = np.asarray(rest[name])[kept]
     x = None if features is None else np.asarray(features)[kept]

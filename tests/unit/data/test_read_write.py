@@ -195,6 +195,7 @@ def test_written_logs_and_labels_come_back(tmp_path, suffix):
         prediction=[1, 2, 3, 4],
         weight=[1, 0.5, 0, 2],
         context=[0, 1, 1, 0],
+        cluster=[7, 7, -1, 3],
     )
     write(tmp_path / f"labels{suffix}", labels)
     assert_same(read(tmp_path / f"labels{suffix}"), labels)

@@ -174,6 +174,25 @@ def test_few_labels_hide_neither_the_worth_nor_small_scales():
     assert re.search(r"go with \S*e-", told)
 
 
+@pytest.mark.parametrize("predicted", [True, False])
+def test_rows_of_one_cluster_count_as_one(predicted):
+    """Every row ten times, as of a log that repeats itself: clusters give the errors of the rows that there are."""
+    data = rows(predicted=predicted)
+    many = np.repeat(np.arange(340), 10)
+    again = {name: getattr(data, name)[many] for name in ("x", "y", "labelled")}
+    again |= {"prediction": data.prediction[many]} if predicted else {}
+
+    def spread(data):
+        found, told = said(lambda: label_data(data, seed=1))
+        return float(found["prior_scale"][0]), told
+
+    single, _ = spread(data)
+    clustered, told = spread(Labels(**again, cluster=many))
+    assert clustered == pytest.approx(single, rel=0.15)
+    assert spread(Labels(**again))[0] < 0.5 * single
+    assert not any("differ" in text for text in told)
+
+
 def test_each_context_of_a_file_has_a_lambda():
     data = rows(context=np.arange(340) % 2)
     found, _ = said(lambda: label_data(data, loss="mean", by="context"))
