@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from dtprob import __version__
-from dtprob.case import load_case, read_document
+from dtprob.case import load_case
 from dtprob.commands.progress import unread
 from dtprob.errors import InputError, nearest, raised_at
 from dtprob.files import let_go
 from dtprob.reproduce import FIGURES
+from dtprob.sections import read_document
 from dtprob.stopping import Stopping
 from dtprob.threads import one_thread
 from dtprob.xla import avoid_miscompilation

@@ -7,7 +7,6 @@ from pathlib import Path
 
 import jax
 
-from dtprob.case import check_seed
 from dtprob.commands.run import session
 from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
@@ -15,6 +14,7 @@ from dtprob.files import make_folder
 from dtprob.reproduce import FIGURES
 from dtprob.reproduce.figure import write
 from dtprob.reproduce.progress import Progress
+from dtprob.sections import check_seed
 
 
 def run(figure: str, out: Path, *, runs: int | None, seed: int, resume: bool) -> None:

@@ -10,13 +10,14 @@ from typing import Any, Final, Literal
 
 import jax
 
-from dtprob.case import Case, EngineSection, check_seed
+from dtprob.case import Case, EngineSection
 from dtprob.commands.cache import keep_compiled
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
 from dtprob.errors import InputError
 from dtprob.files import check_apart, make_folder, sha256, write_text
 from dtprob.inference import LATENTS_ONLY, Posterior, RunOptions
+from dtprob.sections import check_seed
 from dtprob.workflow import Prepared, prepare
 
 _BESIDE: Final = (".nc", ".identity", ".begun", ".checkpoint", ".status.json")

@@ -8,11 +8,11 @@ from pathlib import Path
 import jax
 import jax.numpy as jnp
 
-from dtprob.case import check_seed
 from dtprob.commands.run import session
 from dtprob.control import TablePolicy, export
 from dtprob.data import NetworkLog, write
 from dtprob.files import check_apart, make_folder, write_text
+from dtprob.sections import check_seed
 from dtprob.workflow.loop import (
     State,
     Twin,

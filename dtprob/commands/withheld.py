@@ -14,11 +14,11 @@ from typing import Any, Final
 
 from pebble import ProcessExpired, ProcessPool
 
-from dtprob.case import check_seed
 from dtprob.commands.progress import Say, telling
 from dtprob.edition import edition
 from dtprob.errors import InputError, unknown_name
 from dtprob.files import make_folder, sha256, write_text
+from dtprob.sections import check_seed
 
 TRACKS: Final = {
     "channel": "dtprob.physical.cases",

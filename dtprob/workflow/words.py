@@ -7,9 +7,9 @@ from typing import Any, Final
 
 import numpy as np
 
-from dtprob.case import Words
 from dtprob.data.arrays import is_number
 from dtprob.errors import InputError, nearest, unknown_name
+from dtprob.sections import Words
 
 _MOST: Final = 24
 """Different words up to which a column is told as a list that the CASE could have."""

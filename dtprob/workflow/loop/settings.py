@@ -5,11 +5,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final, final
 
-from dtprob.case import EffectsSection, ModelSection, Options, SeedSection, parse_sections, read_document
+from dtprob.case import EffectsSection, ModelSection, SeedSection
 from dtprob.effects import summaries
 from dtprob.effects.network import FAMILIES
 from dtprob.errors import InputError, unknown_name
 from dtprob.models.multi_access import Clusters, Kernel
+from dtprob.sections import Options, parse_sections, read_document
 
 MODEL: Final = "multi_access"
 OPTIONS: Final = ("clusters", "capacity", "traffic", "concentration")
