@@ -21,7 +21,9 @@ _ENTRIES: Final = 3
 """Entries that a cluster may have, at most."""
 _REACH: Final = 3.0
 """Standard deviations of the largest plausible spread up to which entries are looked for."""
-_LINE: Final = 193
+_ALONE: Final = 6.0
+"""The same of one entry alone: what has the field's entries in common is plausible up to larger sizes."""
+_LINE: Final = 385
 _PER_WAVE: Final = 4
 """Trials for each peak along one entry."""
 _FLAT: Final = 1.0
@@ -31,6 +33,8 @@ _FAR_BELOW: Final = 1e6
 _TRIALS: Final = 8192
 _WORK: Final = 100_000_000
 """Combinations of entries that are tried, at most, and observations in all of these; beyond, they reach less far."""
+_COSINE: Final = 1e-6
+"""Share of a cosine by which terms may differ from it."""
 _PEAKS: Final = 6
 """Highest peaks that are looked at more finely."""
 _FINER: Final = 3
@@ -44,6 +48,13 @@ class Point(NamedTuple):
 
     entries: Float[np.ndarray, "cluster entry"]
     turn: Float[np.ndarray, " cluster"]
+
+
+class _Lines(NamedTuple):
+    """Entries moved one at a time, as far as they are looked for, and what clusters add to the log posterior there."""
+
+    points: Float[np.ndarray, "line trial entry"]
+    terms: Float[np.ndarray, "line trial cluster"]
 
 
 class _Grid(NamedTuple):
@@ -83,8 +94,7 @@ class Trials:
 
     def __call__(self, fields: Float[np.ndarray, "trial cluster entry"]) -> tuple[Terms, Terms]:
         """Terms of the log posterior, -inf where they are not finite, and how far angles are turned for these."""
-        values = self._told(fields, self._points)
-        return values.max(axis=0), self._turns[values.argmax(axis=0)]
+        return _best_turn(self._told(fields, self._points), self._turns)
 
     def unturned(self, entries: Float[np.ndarray, " entry"]) -> Float[np.ndarray, " cluster"]:
         """Terms with the same entries in all clusters and no angle turned."""
@@ -117,16 +127,20 @@ class Trials:
         return max(self.grid.counts) > _number(1)
 
     @cached_property
+    def lines(self) -> _Lines:
+        """Each entry alone, also farther than combinations of them are looked for."""
+        offsets = np.linspace(-_ALONE, _ALONE, _LINE) * plausible_spread(self.effect)
+        points = np.eye(self.entries)[:, None] * offsets[:, None]
+        return _Lines(points, np.stack([self(self._everywhere(line))[0] for line in points]))
+
+    @cached_property
     def grid(self) -> _Grid:
         """Entries as close together as each alone makes the log posterior wave, the null among them."""
+        counts = [_count(terms) for terms in self.lines.terms]
         spread = plausible_spread(self.effect)
-        offsets = np.linspace(-_REACH, _REACH, _LINE) * spread
-        counts = []
-        for j in range(self.entries):
-            points = np.zeros((_LINE, self.entries))
-            points[:, j] = offsets
-            counts.append(_count(self(self._everywhere(points))[0]))
-        spacing = 2 * _REACH * spread / np.maximum(np.array(counts) - 1, 1)
+        spacing = 2 * _ALONE * spread / np.maximum(np.array(counts) - 1, 1)
+        within = 2 * np.floor(_REACH * spread / spacing + 1e-9).astype(int) + 1
+        counts = [min(count, int(most)) for count, most in zip(counts, within, strict=True)]
         most = min(_TRIALS, max(_WORK // (self.problem.observed.count * len(self._turns)), _LINE))
         while np.prod(counts) > most:
             counts[int(np.argmax(counts))] -= 2
@@ -145,6 +159,8 @@ def best(
 ) -> tuple[Float[np.ndarray, " cluster"], Point]:
     """Terms where entries and angles are best, the choice among trials paid for, and what these are.
 
+    Combinations of entries are tried as far as there is time for them, and each entry alone as far as any is plausible.
+
     Args:
         trials: of a field.
         null: terms without it.
@@ -152,9 +168,10 @@ def best(
             cluster has entries of its own.
     """
     null = _pooled(null[None], null, touched)[0]
-    price = float(np.log(len(trials.grid.points)))
+    price = float(np.log(len(trials.grid.points) + _LINE * trials.entries))
     value, kept = null, Point(np.zeros((len(null), trials.entries)), np.zeros(len(null)))
-    for peak in _peaks(trials.grid, _pooled(trials.on_grid, null, touched)):
+    farther = _beyond(trials, null, touched)
+    for peak in itertools.chain(_peaks(trials.grid, _pooled(trials.on_grid, null, touched)), farther):
         terms, point = _refined(trials, peak, null, touched)
         is_better = terms - price > value
         value = np.where(is_better, terms - price, value)
@@ -163,6 +180,23 @@ def best(
             np.where(is_better, point.turn, kept.turn),
         )
     return value, kept
+
+
+def _best_turn(values: Float[np.ndarray, "turn trial cluster"], turns: np.ndarray) -> tuple[Terms, Terms]:
+    """The highest terms over turns all round the circle, and where they are.
+
+    A common phase of what is received with normal noise adds a cosine, so that a few turns tell what all of them do. At
+    high signal-to-noise ratios the best of the few lies far below.
+    """
+    highest, turn = values.max(axis=0), turns[values.argmax(axis=0)]
+    if len(turns) < 3:
+        return highest, turn
+    finite = np.where(np.isfinite(values), values, np.nan)
+    wave = 2 * np.tensordot(np.exp(1j * turns), finite, 1) / len(turns)
+    mean = finite.mean(axis=0)
+    told = mean + np.real(np.conj(wave) * np.exp(1j * turns)[:, None, None])
+    is_cosine = np.abs(told - finite).max(axis=0) < _COSINE * (1.0 + np.abs(wave))
+    return np.where(is_cosine, mean + np.abs(wave), highest), np.where(is_cosine, np.angle(wave), turn)
 
 
 def _pooled(
@@ -195,6 +229,17 @@ def _peaks(grid: _Grid, values: Terms) -> Iterator[Float[np.ndarray, "cluster en
     peaks = np.where(shaped >= around, shaped, -np.inf).reshape(values.shape)
     for chosen in np.argsort(-peaks, axis=0)[:_PEAKS]:
         yield grid.points[chosen]
+
+
+def _beyond(
+    trials: Trials, null: Float[np.ndarray, " cluster"], touched: Bool[np.ndarray, " cluster"] | None
+) -> Iterator[Float[np.ndarray, "cluster entry"]]:
+    """Where each entry alone is best, if combinations do not reach so far for every cluster: a mast of another height."""
+    reach = trials.grid.points.max(axis=0)
+    for points, terms in zip(*trials.lines, strict=True):
+        peak = points[_pooled(terms, null, touched).argmax(axis=0)]
+        if np.any(np.abs(peak) > reach):
+            yield peak
 
 
 def _refined(

@@ -23,7 +23,7 @@ from dtprob.gap.view import View, view
 from dtprob.gap.which.classes import IDLE
 from dtprob.gap.which.stand_in import stands_in
 from dtprob.gap.which.starts import beside, exchanged, promising, refitted_with, refitted_without
-from dtprob.gap.which.trials import Say, Start, Trials, best, credit, remembered, tried
+from dtprob.gap.which.trials import Say, Start, Trials, as_good, best, credit, remembered, tried
 
 _RETURNS: Final = 3
 """Times that a search may find its starting fit to be no optimum."""
@@ -224,7 +224,7 @@ def _forward(
         near = (1 - _WITHIN) * goal + _WITHIN * base.log_evidence
         if credit(problem, trials.fits[accepted], base) > near:
             keys = key_for(key, f"revision {len(steps)}")
-            steps += _revised(steps[-1], base, keys, settings, say, banned=banned)
+            steps += _revised(tuple(steps), base, keys, settings, say, banned=banned)
         reached = steps[-1].end
         problem, fitted = reached.problem, reached.fitted
 
@@ -267,12 +267,20 @@ def _looked(
 
 
 def _revised(
-    last: Step, base: fitting.Fit, key: jax.Array, settings: Settings, say: Say, *, banned: str | None
+    steps: Sequence[Step],
+    base: fitting.Fit,
+    key: jax.Array,
+    settings: Settings,
+    say: Say,
+    *,
+    banned: str | None,
 ) -> Iterator[Step]:
     """Every other effect once more, beside the ones chosen since: kept, or another one in its place, or none.
 
-    The first choice was made while the other effects were still in the data, and may have been made for them.
+    The first choice was made while the other effects were still in the data, and may have been made for them. What was as
+    good as it then is looked at beside it.
     """
+    last, before = steps[-1], [step.trials for step in steps]
     looked = {frozenset(last.view.fitted.effects)}
     settings = replace(settings, candidates=min(settings.candidates, _REVISED))
     for i in range(_REVISIONS):
@@ -286,6 +294,8 @@ def _revised(
         again = key_for(key, f"look {i}")
         # chosen by scores alone
         seen = _looked(rest.problem, rest.fitted, again, settings, say, located=False)
-        trials = tried(seen, settings, say, {left_out: reached}, banned=banned)
+        rivals = as_good(left_out, before, seen)
+        trials = tried(seen, settings, say, {left_out: reached}, banned=banned, earlier=rivals)
+        before.append(trials)
         last = Step(seen, trials, best(seen, base, trials.fits, settings))
         yield last

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 from typing import Final
@@ -45,6 +45,8 @@ _MUCH: Final = 0.1
 """Share of the best one's gain from which on a candidate is remembered."""
 _REMEMBERED: Final = 2
 """Candidates that are remembered at most."""
+_AS_GOOD: Final = 3.0
+"""Nats that a candidate may have fallen short of another one that it was as good as."""
 _POLISHED_LATER: Final = 1
 """New refits that are freed from local optima beside effects that are fitted already: the fit with these was freed, too."""
 _LARGE_GAP: Final = 100.0
@@ -96,6 +98,27 @@ def remembered(before: View, trials: Trials, seen: View) -> dict[str, Found]:
     return {name: Found(gain[name], seen.fitted.x, trials.fits[name].x[at]) for name, at in index.items()}
 
 
+def as_good(name: str, before: Iterable[Trials], seen: View) -> dict[str, Found]:
+    """Mean effects that were as good as one where both were refitted, at their sizes there, the best first.
+
+    Where that one is looked at again beside others, they are its rivals still, whatever their scores at the null say.
+
+    Args:
+        name: the one.
+        before: refits at earlier steps.
+        seen: the fit beside which it is looked at again.
+    """
+    able = {e.name: e for e in seen.problem.effects if e.kind == "mean" and e.name not in seen.fitted.effects}
+    found: dict[str, Found] = {}
+    for trials in (one for one in before if name in one.fits):
+        worth = {n: one.log_evidence - trials.fits[name].log_evidence for n, one in trials.fits.items()}
+        for rival in (n for n in worth if n in able and n != name and worth[n] > -_AS_GOOD):
+            at = trials.problem.layout.of(able[rival])
+            found[rival] = Found(worth[rival], seen.fitted.x, trials.fits[rival].x[at])
+    most = sorted(found, key=lambda rival: -found[rival].gain)
+    return {rival: found[rival] for rival in most[:_REMEMBERED]}
+
+
 def tried(
     seen: View,
     settings: Settings,
@@ -113,7 +136,7 @@ def tried(
         say: receives one line for each.
         known: candidates to refit in any case, by name, with where to start.
         banned: a candidate that is not to be tried.
-        earlier: candidates that gained much before; see `remembered`.
+        earlier: candidates that gained much before, or were as good as another; see `remembered` and `as_good`.
     """
     screening, fitted = seen.screening, seen.fitted
     scans: list[dict[str, Found]] = []

@@ -14,6 +14,7 @@ from dtprob.gap.fitting import fit as fitting
 from dtprob.gap.fitting.base import fit_base
 from dtprob.gap.fitting.refit import refit
 from dtprob.gap.model.problem import Problem
+from dtprob.gap.which import entries
 from dtprob.gap.which.each import scan_each
 from dtprob.models.declaration import model
 
@@ -117,6 +118,29 @@ def test_what_several_receivers_share_is_found_in_place_of_a_field(effect, touch
     assert EACH.name not in found
     assert max(found, key=lambda name: found[name].gain) == effect.name
     np.testing.assert_allclose(found[effect.name].parameters, [0.13, -0.21], atol=0.02)
+
+
+def test_what_is_far_along_one_axis_is_found_where_combinations_do_not_reach(monkeypatch):
+    """With so few trials they end at 5 cm; antennas stand 27 cm higher."""
+    monkeypatch.setattr(entries, "_TRIALS", 300)
+    moved = np.zeros((14, 2))
+    moved[:, 1] = 0.27
+    problem, base = received(moved)
+    found = scan_each(problem, base.x, [EACH.name, ALL.name])
+    np.testing.assert_allclose(found[ALL.name].parameters, [0.0, 0.27], atol=0.02)
+
+
+def test_the_best_turn_is_told_by_a_few_where_terms_are_a_cosine():
+    turns = np.linspace(-np.pi, np.pi, 8, endpoint=False)[:, None, None]
+    shift, size = np.random.default_rng(0).uniform([-3.0, 5.0], [3.0, 5e4], (4, 6, 2)).transpose(2, 0, 1)
+    cosine = 7.0 + size * np.cos(turns - shift)
+    highest, turn = entries._best_turn(cosine, turns.ravel())
+    np.testing.assert_allclose(highest, 7.0 + size, rtol=1e-9)
+    np.testing.assert_allclose(turn, shift, atol=1e-9)
+    for other in (cosine + 0.1 * size * np.cos(2 * turns), np.where(turns == 0.0, -np.inf, cosine)):
+        highest, turn = entries._best_turn(other, turns.ravel())
+        np.testing.assert_allclose(highest, other.max(axis=0))
+        np.testing.assert_allclose(turn, turns.ravel()[other.argmax(axis=0)])
 
 
 def test_what_moves_receivers_each_by_something_else_is_no_field_with_entries_in_common():

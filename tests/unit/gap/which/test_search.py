@@ -151,3 +151,38 @@ def test_of_two_ways_the_one_without_an_idle_effect_stands(gains, first):
         found = search._ranked(problem, order, base)
         assert found[0][-1].view.fitted.effects == first
         assert sorted(map(id, found)) == sorted(map(id, ways))
+
+
+def test_an_earlier_choice_is_looked_at_again_beside_what_was_as_good(monkeypatch):
+    """Beside a, b and c were alike; once a is given up, b is looked at again, and c with it."""
+    problem = SimpleNamespace(effects=[SimpleNamespace(name=n, kind="mean") for n in "abc"])
+
+    def fitted(*effects):
+        return SimpleNamespace(effects=effects, log_evidence=9.0, within=lambda problem: problem)
+
+    def view(one):
+        return SimpleNamespace(problem=problem, fitted=one)
+
+    step = search.Step(view(fitted("a")), Trials(problem, {"b": fitted("a", "b")}), "b")
+    asked = []
+
+    def as_good(name, before, seen):
+        asked.append((name, len(before)))
+        return {"c": None}
+
+    def tried(seen, settings, say, known, *, banned, earlier):
+        assert list(earlier) == ["c"]
+        return Trials(problem, {"b": fitted("b")})
+
+    def without(problem, fit, name):
+        return SimpleNamespace(problem=problem, fitted=fitted(*(e for e in fit.effects if e != name)))
+
+    monkeypatch.setattr(search, "as_good", as_good)
+    monkeypatch.setattr(search, "tried", tried)
+    monkeypatch.setattr(search, "refitted_without", without)
+    monkeypatch.setattr(search, "_looked", lambda problem, fitted, *_, **__: view(fitted))
+    monkeypatch.setattr(search, "best", lambda seen, *_: None if seen.fitted.effects else "b")
+    keys = jax.random.key(0), Settings(), lambda _: None
+    found = list(search._revised((step,), fitted(), *keys, banned=None))
+    assert [(one.view.fitted.effects, one.accepted) for one in found] == [(("b",), None), ((), "b")]
+    assert asked == [("a", 1), ("b", 2)]

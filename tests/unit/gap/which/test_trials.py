@@ -109,3 +109,28 @@ def test_what_gains_at_its_whole_size_at_the_fit_is_not_absorbed():
     absorbed = ("wall", "tilt", "swap", "drift")
     assert chosen({"near": 90.0}, [fit, anew, centre], 6, absorbed) == ["near", "tilt"]
     assert chosen({"near": 90.0}, [fit, anew, centre], 6) == ["near", "wall", "tilt", "drift"]
+
+
+def fit_of(worth, *effects):
+    x = np.array([float(NAMES.index(effects[-1]) + 1)] * len(NAMES))
+    return SimpleNamespace(effects=effects, log_evidence=worth, x=x)
+
+
+def test_what_was_as_good_as_an_effect_is_its_rival_when_that_is_looked_at_again():
+    """`far` fell short by 1 nat, `tilt` by 9, `swap` stands beside already, `near` was as good beside another choice."""
+    layout = SimpleNamespace(of=lambda one: np.array([NAMES.index(one.name)]))
+    problem = cast("Any", SimpleNamespace(layout=layout))
+    worth = {"wall": 50.0, "far": 49.0, "tilt": 41.0, "swap": 50.0}
+    first = trials.Trials(problem, {n: cast("Any", fit_of(w, "drift", n)) for n, w in worth.items()})
+    other = trials.Trials(problem, {"near": cast("Any", fit_of(50.0, "near"))})
+    seen = cast(
+        "Any",
+        SimpleNamespace(
+            problem=SimpleNamespace(effects=[effect(name) for name in NAMES]), fitted=fit_of(0.0, "swap")
+        ),
+    )
+    found = trials.as_good("wall", [first, other], seen)
+    assert list(found) == ["far"]
+    assert found["far"].parameters == [2.0]
+    assert found["far"].gain == -1.0
+    np.testing.assert_array_equal(found["far"].x, seen.fitted.x)
