@@ -14,6 +14,8 @@ _SOME: Final = 0.2
 """Share of the gap that causes close at least, surely, where what is left is of another kind."""
 _IDLE: Final = 0.5
 """Share of what a cause had gained below which it does little beside a model of what it leaves."""
+_NO_NOISE: Final = 1e-6
+"""P-value of what is left below which a noise that differs between clusters is none: whatever is wrong looks like it."""
 
 
 def decide(evidence: Evidence, causes: tuple[Cause, ...], settings: Settings) -> Verdict:
@@ -71,15 +73,22 @@ def _leaves_moments(evidence: Evidence, level: float) -> bool:
 
 
 def _hides(evidence: Evidence, level: float) -> bool:
-    """Whether all that was named is how observations spread, which hides a wrong law of their values and is idle beside it.
+    """Whether all that was named is how observations spread, which hides a wrong law of their values.
 
-    Beside a twin that is far too sure of itself any noise closes nearly all of a gap.
+    Beside a twin that is far too sure of itself any noise closes nearly all of a gap. It hides one where it is idle beside
+    a model of what it leaves; and a random one, which each cluster has of its own, where that is no noise beyond doubt:
+    one receiver that stands elsewhere seems to be a noisy one.
     """
-    rest, locating = evidence.remainder, evidence.steps[0].view.screening.scores.locating
-    values = [s for s in evidence.after.sites if s.p_value <= level and s.is_of_values]
-    if rest is None or not values or not locating.isdisjoint(evidence.accepted):
+    locating = evidence.steps[0].view.screening.scores.locating
+    wrong = [s for s in evidence.after.sites if s.p_value <= level and (s.is_of_values or s.is_dependence)]
+    if not wrong or not locating.isdisjoint(evidence.accepted):
         return False
-    return rest.beside < _IDLE * (evidence.fitted.log_evidence - evidence.base.log_evidence)
+    if _are_fields(evidence) and min((s.p_value for s in wrong if not s.last), default=1.0) <= _NO_NOISE:
+        return True
+    if evidence.remainder is None or not any(s.is_of_values for s in wrong):
+        return False
+    gained = evidence.fitted.log_evidence - evidence.base.log_evidence
+    return evidence.remainder.beside < _IDLE * gained
 
 
 def _relevance(evidence: Evidence, settings: Settings) -> float:

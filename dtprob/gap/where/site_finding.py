@@ -76,6 +76,11 @@ class SiteFinding:
         return self.moment is None and not self.spreads
 
     @property
+    def is_dependence(self) -> bool:
+        """Whether readings depend on each other."""
+        return self.kind.startswith("dependence")
+
+    @property
     def is_of_far(self) -> bool:
         """Whether it is of readings that lie far out, to both sides or to one."""
         return self.moment in ("tails", "skewness")

@@ -210,3 +210,19 @@ def test_noise_that_hides_a_law_is_no_cause(left, locates, beside, verdict):
     given.remainder = SimpleNamespace(beside=beside)
     given.fitted, given.base = SimpleNamespace(log_evidence=-50.0), SimpleNamespace(log_evidence=-150.0)
     assert decide(given, (cause(0.995),), Settings()) == verdict
+
+
+@pytest.mark.parametrize(
+    ("kind", "left", "p_after", "verdict"),
+    [
+        ("variance", "additive", 1e-9, "UNLISTED"),
+        ("variance", "dependence along subcarrier", 1e-9, "UNLISTED"),
+        ("variance", "additive", 1e-4, "LISTED_WITH_REMAINDER"),
+        ("variance", "tails", 1e-9, "LISTED_WITH_REMAINDER"),
+        ("mean", "additive", 1e-9, "LISTED"),
+    ],
+)
+def test_a_noise_of_each_cluster_whose_readings_hang_together_is_none(kind, left, p_after, verdict):
+    """A receiver that stands elsewhere seems to be a noisy one, in whose residuals neighbours are alike."""
+    given = evidence(kind, p_after, left=left, locates=False)
+    assert decide(given, (cause(0.97),), Settings()) == verdict
