@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Final
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import Any, Final
 
 import numpy as np
 from scipy import stats
@@ -17,7 +18,19 @@ _CHANCE: Final = 0.01
 """Probability up to which the largest of so many entries may be that large by chance."""
 
 
-def foremost(named: FamilyTest, tests: Sequence[FamilyTest], site: Site) -> str | None:
+type Names = Mapping[str, Sequence[str]]
+"""What the entries along an axis are called."""
+
+
+def names_of_entries(data: Mapping[str, Any]) -> Names:
+    """Of the objects of a traced scene in a model's data; of no other axis."""
+    traced = next((value for value in data.values() if hasattr(value, "object_names")), None)
+    return {} if traced is None else {"object": traced.object_names}
+
+
+def foremost(
+    named: FamilyTest, tests: Sequence[FamilyTest], site: Site, names: Names = MappingProxyType({})
+) -> str | None:
     """The place of the entry that brings most of what is wrong, in words; None where several do, or where it has none.
 
     One far reading shows in every ripple, so that where the family that is named has no such entry, single ones are asked,
@@ -27,12 +40,15 @@ def foremost(named: FamilyTest, tests: Sequence[FamilyTest], site: Site) -> str 
         named: the test of the family that is named.
         tests: of all families of the site.
         site: that they perturb.
+        names: by which entries are told instead of by their numbers.
     """
     kind, whole = named.family.kind, _excess(named)
     single = (
         t for t in tests if t.family.kind == kind and t.family.pattern.curves is None and t.p_value <= _CHANCE
     )
-    found = (_entry(test, site, whole) for test in (named, *sorted(single, key=lambda t: -len(t.variance))))
+    found = (
+        _entry(test, site, whole, names) for test in (named, *sorted(single, key=lambda t: -len(t.variance)))
+    )
     return next((place for place in found if place is not None), None)
 
 
@@ -44,7 +60,7 @@ def _excess(test: FamilyTest) -> float:
     return float(excess.reshape(curves.extent[0], -1).sum(axis=1).max())
 
 
-def _entry(test: FamilyTest, site: Site, whole: float) -> str | None:
+def _entry(test: FamilyTest, site: Site, whole: float, names: Names) -> str | None:
     """The entry of one family that brings most of its excess and of the whole one, that of the family that is named."""
     curves = test.family.pattern.curves
     if curves is not None and (curves.overlaps or not curves.places):
@@ -55,10 +71,10 @@ def _entry(test: FamilyTest, site: Site, whole: float) -> str | None:
     by_chance = len(told) * stats.chi2.sf(told[top], max(int(seen[top]), 1))
     if len(told) < 2 or excess[top] < _MOST * max(float(excess.sum()), whole) or by_chance > _CHANCE:
         return None
-    return _words(test, site, top, len(told))
+    return _words(test, site, top, len(told), names)
 
 
-def _words(test: FamilyTest, site: Site, entry: int, count: int) -> str:
+def _words(test: FamilyTest, site: Site, entry: int, count: int, names: Names) -> str:
     """An entry by its group and its positions along the axes that have weights of their own."""
     pattern, words = test.family.pattern, []
     axes = list(pattern.kept)
@@ -69,4 +85,10 @@ def _words(test: FamilyTest, site: Site, entry: int, count: int) -> str:
             axes.pop(0)  # the curves run along the first ones
     place = np.unravel_index(entry, [site.value.shape[i] for i in axes]) if axes else ()
     wide = [(i, n) for i, n in zip(axes, place, strict=True) if site.value.shape[i] > 1]
-    return ", ".join([*words, *(f"{site.axes[i]} {n}" for i, n in wide)])
+    return ", ".join([*words, *(f"{site.axes[i]} {_called(site, i, int(n), names)}" for i, n in wide)])
+
+
+def _called(site: Site, axis: int, position: int, names: Names) -> str:
+    """The name of a position along an axis, its number where there is none."""
+    found = names.get(site.axes[axis], ())
+    return found[position] if len(found) == site.value.shape[axis] else str(position)

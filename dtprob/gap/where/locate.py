@@ -24,7 +24,7 @@ from dtprob.gap.where.differences import Differences, differences
 from dtprob.gap.where.families import Family, Site, deterministic, families, observed, shifted
 from dtprob.gap.where.family_test import CHANCE, FamilyTest, family_test
 from dtprob.gap.where.far_readings import far_readings, held, naming
-from dtprob.gap.where.foremost import foremost
+from dtprob.gap.where.foremost import foremost, names_of_entries
 from dtprob.gap.where.gains import gains
 from dtprob.gap.where.in_all import InAll
 from dtprob.gap.where.moments import further_moments
@@ -242,7 +242,7 @@ def _finding(
     named, place = best, None
     if p_value <= SURE:
         named = plainest(best, tests)
-        place = foremost(named, tests, site)
+        place = foremost(named, tests, site, names_of_entries(problem.data))
     curves, parts = best.family.pattern.curves, 2 if np.iscomplexobj(site.value) else 1
     fewest = (int(entries.sum()) for entries in problem.observed.counted.values())
     return SiteFinding(

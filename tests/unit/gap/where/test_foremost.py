@@ -12,7 +12,7 @@ from dtprob.gap.settings import Settings
 from dtprob.gap.where.curves import Curves, grouped, groups_in_words
 from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import FamilyTest
-from dtprob.gap.where.foremost import foremost
+from dtprob.gap.where.foremost import foremost, names_of_entries
 from dtprob.inference import Laplace
 from tests.unit.gap.examples import of_access_points
 
@@ -34,6 +34,18 @@ def test_the_entry_that_brings_most_is_named():
     assert told(scores) == "link 17"
     assert told(scores, (0, 1), shape=(20, 3)) == "link 5, antenna 2"
     assert told(scores, (0,), shape=(30, 1), dtype=complex) == "link 8"
+
+
+def test_objects_of_a_scene_are_called_by_their_names():
+    scene = SimpleNamespace(object_names=("floor", "wall_a", "wall_b"))
+    names = names_of_entries({"level": np.zeros(3), "paths": scene})
+    scores = np.array([0.3, -0.5, 9.0])
+    family = Family("additive", Pattern("object", (0,)), np.ones(()))
+    test = FamilyTest(family, 1e-9, np.ones(9), np.stack([scores] * 9), np.ones(3))
+    site = SimpleNamespace(axes=("object",), value=np.ones(3))
+    assert foremost(test, [test], site, names) == "object wall_b"
+    assert foremost(test, [test], site, {"object": ("floor", "wall")}) == "object 2"
+    assert names_of_entries({"level": np.zeros(3)}) == {}
 
 
 def test_none_is_named_where_several_are_wrong_or_all_may_be_chance():
