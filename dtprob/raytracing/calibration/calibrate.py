@@ -1,7 +1,6 @@
 """The loop of a calibration: an E-step for the phases, a gradient step for the materials."""
 
 import warnings
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -15,6 +14,7 @@ from jaxtyping import Array, Complex, Float, Int
 from dtprob.errors import InputError
 from dtprob.raytracing.calibration import phases
 from dtprob.raytracing.calibration.groups import check_groups, untouched
+from dtprob.raytracing.calibration.objective import objective_of, residual, turned
 from dtprob.raytracing.calibration.phases import Field, Phasors
 from dtprob.raytracing.calibration.settings import Settings
 from dtprob.raytracing.calibration.statistics import Statistics
@@ -170,13 +170,27 @@ def _runs(task: _Task, statistics: Statistics, noise_power: Float[Array, "run li
 
 
 def _calibrate(task: _Task, statistics: Statistics, noise_power: Float[Array, " link"]) -> Calibration:
+    """From each concentration that the settings name; the answer of the lowest free energy is kept."""
+
+    def arrive(concentration: Array) -> tuple[Calibration, Array]:
+        return _calibrate_from(concentration, task, statistics, noise_power)
+
+    found, energy = lax.map(arrive, jnp.asarray(task.settings.starts, statistics.energy.dtype))
+    best = jnp.argmin(jnp.where(jnp.isnan(energy), jnp.inf, energy))
+    return jax.tree.map(lambda leaf: leaf[best], found)
+
+
+def _calibrate_from(
+    concentration: Array, task: _Task, statistics: Statistics, noise_power: Float[Array, " link"]
+) -> tuple[Calibration, Array]:
+    """One search, and the free energy where it ends."""
     settings = task.settings
     optimiser = optax.chain(optax.clip_by_global_norm(settings.clip), optax.adam(settings.rate))
 
     def step(state: _State, number: Array) -> tuple[_State, Array]:
         (real, imaginary), pull = jax.vjp(task.gain, state.coordinates)
         state = _expect(settings, state, lax.complex(real, imaginary), statistics, number)
-        objective = _objective(settings, state.phasors, _turned(statistics, state.turn))
+        objective = objective_of(settings, state.phasors, turned(statistics, state.turn))
         loss, slopes = jax.value_and_grad(lambda parts: objective(lax.complex(*parts)))((real, imaginary))
         (slope,) = pull(slopes)
         moves, moments = optimiser.update(slope, state.moments)
@@ -187,23 +201,37 @@ def _calibrate(task: _Task, statistics: Statistics, noise_power: Float[Array, " 
     start = jnp.log(jnp.asarray([settings.permittivity - 1.0, settings.conductivity], kind))
     coordinates = jnp.repeat(start[:, None], task.count, axis=1)
     one = jnp.ones_like(statistics.product)
+    turn = one[..., :1]
+    if settings.global_phase:  # else a search would end elsewhere for other common phases
+        turn = _coherent(lax.complex(*task.gain(coordinates)), statistics)
     state = _State(
         coordinates,
         optimiser.init(coordinates),
-        Phasors(one, jnp.ones_like(jnp.real(one))),
-        jnp.asarray(settings.concentration, kind),
+        phases.certain(one),
+        concentration,
         noise_power,
-        one[..., :1],
+        turn,
     )
     state, losses = lax.scan(step, state, jnp.arange(settings.steps))
     assumed = {"oblivious": jnp.inf, "uniform": 0.0}.get(settings.scheme)
-    concentration = state.concentration if assumed is None else jnp.asarray(assumed, kind)
-    return Calibration(*task.materials(state.coordinates), concentration, state.noise_power, losses)
+    found = state.concentration if assumed is None else jnp.asarray(assumed, kind)
+    answer = Calibration(*task.materials(state.coordinates), found, state.noise_power, losses)
+    return answer, _free_energy(task, state, statistics) if assumed is None else jnp.zeros((), kind)
 
 
-def _turned(statistics: Statistics, turn: Array) -> Statistics:
-    """The statistics of the measurement turned back by its common phases."""
-    return eqx.tree_at(lambda s: s.product, statistics, statistics.product * jnp.conj(turn))
+def _free_energy(task: _Task, state: _State, statistics: Statistics) -> Array:
+    """E[log q] - E[log p] of the phases and the measurement, nats, after a fresh E-step."""
+    seen = turned(statistics, state.turn)
+    field = _field(lax.complex(*task.gain(state.coordinates)), seen, state)
+    over = state.noise_power[:, None]
+    noise = statistics.size * jnp.log(over) + statistics.energy / over
+    return jnp.sum(phases.free_energy(field, _afresh(field, state.phasors, task.settings)) + noise)
+
+
+def _field(gain: Complex[Array, "link path"], seen: Statistics, state: _State) -> Field:
+    over = state.noise_power[:, None, None]
+    coupling = jnp.conj(gain)[:, :, None] * seen.gram * gain[:, None] / over
+    return Field(jnp.conj(gain)[:, None] * seen.product / over, coupling, state.concentration)
 
 
 def _expect(
@@ -214,28 +242,46 @@ def _expect(
     number: Array,
 ) -> _State:
     """The E-step, and what follows from it in closed form: concentration, noise power, common phases."""
-    if settings.scheme not in ("aware", "aware_reference"):
+    if settings.scheme == "uniform":
         return state
-    seen = _turned(statistics, state.turn)
-    over = state.noise_power[:, None, None]
-    coupling = jnp.conj(gain)[:, :, None] * seen.gram * gain[:, None] / over
-    field = Field(jnp.conj(gain)[:, None] * seen.product / over, coupling, state.concentration)
+    if settings.scheme == "oblivious":
+        turn = _coherent(gain, statistics) if settings.global_phase else state.turn
+        noise_power = state.noise_power
+        if settings.estimate_noise:
+            noise_power = _left(gain, state.phasors, turned(statistics, turn))
+        return state._replace(turn=turn, noise_power=noise_power)
+    seen = turned(statistics, state.turn)
+    field = _field(gain, seen, state)
     phasors, turn = _phasors(field, state.phasors, settings, number), state.turn
     exists = jnp.broadcast_to((field.snr > 0)[:, None], phasors.mean.shape)
     if settings.global_phase:
         # what the angles have in common is the phase of the snapshot: their prior is then most at ease
-        total = jnp.sum(jnp.where(exists, phasors.mean, 0), axis=2, keepdims=True)
-        size = jnp.abs(total)
-        common = jnp.where(size > 0, total / jnp.where(size > 0, size, 1.0), 1.0)
+        common = _direction(jnp.sum(jnp.where(exists, phasors.mean, 0), axis=2, keepdims=True))
         phasors, turn = phasors._replace(mean=phasors.mean * jnp.conj(common)), turn * common
-        seen = _turned(statistics, turn)
+        seen = turned(statistics, turn)
     concentration, noise_power = state.concentration, state.noise_power
     if not settings.fixed_concentration:
         mean = jnp.sum(jnp.where(exists, jnp.real(phasors.mean), 0.0)) / jnp.sum(exists)
         concentration = phases.concentration_of(mean)
     if settings.estimate_noise:
-        noise_power = jnp.mean(_residual(gain, phasors, seen), axis=1) / statistics.size
+        noise_power = _left(gain, phasors, seen)
     return state._replace(phasors=phasors, turn=turn, concentration=concentration, noise_power=noise_power)
+
+
+def _left(gain: Array, phasors: Phasors, seen: Statistics) -> Float[Array, " link"]:
+    """The noise power that the residuals show."""
+    return jnp.mean(residual(gain, phasors, seen), axis=1) / seen.size
+
+
+def _coherent(gain: Complex[Array, "link path"], statistics: Statistics) -> Complex[Array, "link snapshot 1"]:
+    """The common phase of each snapshot with which paths without phase errors fit it best."""
+    return _direction(jnp.einsum("lp,lsp->ls", jnp.conj(gain), statistics.product)[..., None])
+
+
+def _direction(total: Complex[Array, "*n"]) -> Complex[Array, "*n"]:
+    """Numbers over their size, 1 where that is 0."""
+    size = jnp.abs(total)
+    return jnp.where(size > 0, total / jnp.where(size > 0, size, 1.0), 1.0)
 
 
 def _phasors(field: Field, before: Phasors, settings: Settings, number: Array) -> Phasors:
@@ -243,62 +289,13 @@ def _phasors(field: Field, before: Phasors, settings: Settings, number: Array) -
     if settings.scheme == "aware_reference":
         return phases.reference(field)
 
-    def afresh(before: Phasors) -> Phasors:
-        starts = before, phases.no_error(field), phases.reference(field)
-        return phases.best(field, starts, settings.sweeps)
-
-    is_due = number % settings.restart_every == 0
-    return lax.cond(is_due, afresh, lambda before: phases.swept(field, before, 1), before)
-
-
-def _residual(gain: Array, phasors: Phasors, statistics: Statistics) -> Float[Array, "link snapshot"]:
-    """E |h - sum_p exp(j z_p) a_p|^2."""
-    means = phasors.mean * gain[:, None]
-    own = jnp.abs(gain) ** 2 * jnp.real(jnp.diagonal(statistics.gram, axis1=1, axis2=2))
-    crossed = jnp.real(jnp.einsum("lsp,lpq,lsq->ls", jnp.conj(means), statistics.gram, means))
-    matched = jnp.real(jnp.sum(jnp.conj(means) * statistics.product, axis=2))
-    spread = jnp.sum(own[:, None] * (1 - phasors.length**2), axis=2)
-    return statistics.energy - 2 * matched + crossed + spread
+    return lax.cond(
+        number % settings.restart_every == 0,
+        lambda before: _afresh(field, before, settings),
+        lambda before: phases.swept(field, before, 1),
+        before,
+    )
 
 
-def _objective(settings: Settings, phasors: Phasors, statistics: Statistics) -> Callable[[Array], Array]:
-    """What a scheme minimises, as a function of the gains (link, path).
-
-    Each is quadratic, in the gains or in their powers, with coefficients that hold all snapshots.
-    """
-    if settings.scheme == "uniform":
-        return _power_objective(statistics)
-    if settings.scheme == "oblivious":
-        weight = jnp.full_like(statistics.energy, 1 / jnp.sum(statistics.energy))
-        mean, length = jnp.ones_like(phasors.mean), jnp.ones_like(phasors.length)
-    else:
-        heard = statistics.energy > 0  # a link of which nothing was received says nothing of the gains
-        weight = jnp.where(heard, 1 / jnp.where(heard, statistics.energy, 1.0), 0.0) / statistics.energy.size
-        mean, length = phasors.mean, phasors.length
-    linear = jnp.einsum("ls,lsp,lsp->lp", weight, jnp.conj(mean), statistics.product)
-    pairs = jnp.einsum("ls,lsp,lsq->lpq", weight, jnp.conj(mean), mean) * statistics.gram
-    own = jnp.real(jnp.diagonal(statistics.gram, axis1=1, axis2=2))
-    spread = own * jnp.einsum("ls,lsp->lp", weight, 1 - length**2)
-    constant = jnp.sum(weight * statistics.energy)
-
-    def objective(gain: Array) -> Array:
-        fit = jnp.sum(jnp.conj(gain) * jnp.einsum("lpq,lq->lp", pairs, gain))
-        fit -= 2 * jnp.sum(jnp.conj(gain) * linear)
-        return constant + jnp.real(fit) + jnp.sum(spread * jnp.abs(gain) ** 2)
-
-    return objective
-
-
-def _power_objective(statistics: Statistics) -> Callable[[Array], Array]:
-    """Squared difference of measured and modelled powers over the square of the measured ones."""
-    kept = statistics.power
-    if kept is None:
-        raise InputError("statistics for the scheme 'uniform'", "powers", "none", "Project with powers=True")
-    total = jnp.sum(kept.square)
-
-    def objective(gain: Array) -> Array:
-        power = jnp.real(gain) ** 2 + jnp.imag(gain) ** 2
-        fit = jnp.einsum("lp,lpq,lq->", power, kept.normal, power)
-        return (total - 2 * jnp.sum(power * kept.right) + fit) / total
-
-    return objective
+def _afresh(field: Field, before: Phasors, settings: Settings) -> Phasors:
+    return phases.best(field, (before, phases.no_error(field), phases.reference(field)), settings.sweeps)

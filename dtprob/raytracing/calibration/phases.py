@@ -78,8 +78,12 @@ def concentration_of(length: Float[Array, ""]) -> Float[Array, ""]:
 
 def no_error(field: Field) -> Phasors:
     """All angles zero, for certain."""
-    one = jnp.ones_like(field.matched)
-    return Phasors(one, jnp.full(one.shape, _LARGEST, jnp.real(one).dtype))
+    return certain(jnp.ones_like(field.matched))
+
+
+def certain(mean: Complex[Array, "link snapshot path"]) -> Phasors:
+    """Angles that are known: those of phasors of length 1."""
+    return Phasors(mean, jnp.full(mean.shape, _LARGEST, jnp.real(mean).dtype))
 
 
 def reference(field: Field) -> Phasors:
@@ -136,7 +140,7 @@ def free_energy(field: Field, phasors: Phasors) -> Float[Array, "link snapshot"]
     fit += jnp.sum(field.snr[:, None] * (1 - length**2), axis=-1)
     k0 = field.concentration
     exists = (field.snr > 0)[:, None]
-    prior = k0 * jnp.real(mean) - (jnp.log(i0e(k0)) + k0)
+    prior = k0 * (jnp.real(mean) - 1) - jnp.log(i0e(k0))
     entropy = jnp.log(i0e(kappa)) + kappa * (1 - length)
     return fit - jnp.sum(jnp.where(exists, prior + entropy, 0.0), axis=-1)
 

@@ -23,10 +23,13 @@ class Settings:
         clip: largest norm of a gradient.
         permittivity: where every material starts.
         conductivity: where every material starts, S/m.
-        concentration: where that of the phase errors starts; 0 is a uniform phase.
-        fixed_concentration: keep it there.
-        estimate_noise: let the noise power follow the residuals; the given one is then where it starts.
-        global_phase: every snapshot has a phase of its own, common to its paths.
+        concentration: where that of the phase errors starts; 0 is a uniform phase. "aware" searches from each of several
+            and keeps the answer of the lowest free energy: one start alone may end far away where paths are hardly
+            resolved or materials many. Other schemes take the first.
+        fixed_concentration: keep it there, at one value.
+        estimate_noise: let the noise power follow the residuals; the given one is then where it starts. Not for
+            "uniform", which has none.
+        global_phase: every snapshot has a phase of its own, common to its paths; "uniform" looks at no phase anyway.
         restart_every: after how many iterations the E-step starts afresh; in between it goes on with one sweep.
         sweeps: of coordinate updates after a fresh start.
         law: what a wall is, "slab" or "half_space".
@@ -38,7 +41,7 @@ class Settings:
     clip: float = 1.0
     permittivity: float = 3.0
     conductivity: float = 0.1
-    concentration: float = 1.0
+    concentration: float | tuple[float, ...] = (1.0, 100.0, 1e8)
     fixed_concentration: bool = False
     estimate_noise: bool = False
     global_phase: bool = False
@@ -51,14 +54,32 @@ class Settings:
             raise unknown_name("scheme of a calibration", self.scheme, SCHEMES, "scheme")
         if self.law not in LAWS:
             raise unknown_name("law of a wall", self.law, LAWS, "law")
+        if self.scheme == "uniform" and self.estimate_noise:
+            remedy = "Leave estimate_noise out, or choose another scheme"
+            raise InputError("estimate_noise", "a scheme with noise", "the scheme 'uniform'", remedy)
         counts = {"iterations": self.steps, "restart_every": self.restart_every, "sweeps": self.sweeps}
         for name, value in counts.items():
             if value < 1:
                 raise InputError(f"{name} of a calibration", "1 or more", str(value), f"Give a larger {name}")
-        if not self.permittivity > 1 or not self.conductivity > 0 or not self.concentration >= 0:
+        given = self._concentrations
+        low = not given or any(not value >= 0 for value in given)
+        if not self.permittivity > 1 or not self.conductivity > 0 or low:
             got = f"{self.permittivity}, {self.conductivity}, {self.concentration}"
             expected = "a permittivity above 1, a conductivity above 0 and a concentration of 0 or more"
             raise InputError("start of a calibration", expected, got, "Start inside the range")
+        if self.fixed_concentration and len(given) > 1:
+            expected, got = "one value that is kept", f"{len(given)} to start from"
+            raise InputError("concentration of a calibration", expected, got, "Give concentration=...")
+
+    @property
+    def _concentrations(self) -> tuple[float, ...]:
+        given = self.concentration
+        return given if isinstance(given, tuple) else (given,)
+
+    @property
+    def starts(self) -> tuple[float, ...]:
+        """Concentrations from which the scheme searches."""
+        return self._concentrations if self.scheme == "aware" else self._concentrations[:1]
 
     @property
     def steps(self) -> int:

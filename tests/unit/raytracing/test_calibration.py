@@ -354,3 +354,60 @@ def test_noise_powers_that_do_not_fit(paths, array, power):
     statistics = project(paths, TONES, h, rx_array=array, tx_array=array)
     with pytest.raises(InputError, match="noise_power: expected"):
         calibrate(paths, statistics, power)
+
+
+@pytest.mark.parametrize("scheme", ["aware", "oblivious"])
+def test_a_phase_common_to_the_paths_of_a_snapshot_changes_nothing(paths, array, scheme):
+    random = np.random.default_rng(6)
+    shape = paths.n_link, 4, paths.n_path
+    h = measure(paths, array, random.vonmises(0, 8.0, shape), received(paths))
+    turned = h * np.exp(1j * random.uniform(-np.pi, np.pi, (*shape[:2], 1, 1, 1)))
+    settings = Settings(scheme, iterations=30, concentration=1.0, global_phase=True, law="half_space")
+    found, again = (
+        calibrate(
+            paths,
+            project(paths, TONES, each, rx_array=array, tx_array=array, powers=False),
+            received(paths),
+            settings=settings,
+        )
+        for each in (h, turned)
+    )
+    for one, other in zip(found, again, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-6)
+
+
+def test_exact_phases_and_many_materials_are_found_from_several_starts(paths, array):
+    """From a concentration of 1 alone the phases take up what the materials of all objects should, and stay there."""
+    power = received(paths)
+    h = measure(paths, array, np.zeros((paths.n_link, 4, paths.n_path)), power)[
+        :, :, :, 4:5
+    ]  # the element at the centre
+    statistics = project(paths, TONES, h, rx_array=array, powers=False)
+    groups, error = np.arange(paths.n_object), {}
+    for starts in (1.0, Settings().concentration):
+        settings = Settings(iterations=200, concentration=starts, law="half_space")
+        error[starts] = power_error(
+            paths, calibrate(paths, statistics, power, settings=settings, groups=groups)
+        )
+    one, several = error.values()
+    assert several < 0.03
+    assert one > 10 * several
+
+
+def test_settings_that_would_have_no_effect_are_refused():
+    with pytest.raises(InputError, match="scheme with noise"):
+        Settings("uniform", estimate_noise=True)
+    with pytest.raises(InputError, match="one value that is kept"):
+        Settings(fixed_concentration=True)
+    with pytest.raises(InputError, match="inside the range"):
+        Settings(concentration=())
+    assert Settings(concentration=2.0, fixed_concentration=True).starts == (2.0,)
+
+
+def test_the_oblivious_scheme_estimates_noise(paths, array):
+    power = received(paths)
+    h = measure(paths, array, np.zeros((paths.n_link, 4, paths.n_path)), power)
+    statistics = project(paths, TONES, h, rx_array=array, tx_array=array, powers=False)
+    settings = Settings("oblivious", iterations=200, estimate_noise=True, law="half_space")
+    found = calibrate(paths, statistics, 3 * power, settings=settings)
+    np.testing.assert_allclose(found.noise_power, power, rtol=0.1)
