@@ -25,6 +25,11 @@ INTERACTIONS: Final = {
 _STRAIGHT: Final = 1 - 1e-6
 """Cosine of the angle between departure and arrival from which on a path is straight."""
 
+_OFF: Final = 1e-2
+"""Share of a length by which it may differ from the delay's, or fall short of the straight line."""
+_TURNED: Final = 1e-2
+"""How far a phasor of the carrier may be from that of the delay."""
+
 
 class PathSet(eqx.Module):
     """The paths of several links, padded to a common number and depth; `mask` tells which exist.
@@ -195,7 +200,8 @@ def validate(paths: PathSet) -> PathSet:
 
     Raises:
         InputError: an array has another shape, holds NaN or infinity, an index out of range, an unknown
-            code of interaction, or a direction that is not of unit length.
+            code of interaction, a direction that is not of unit length, or a delay, length, carrier phasor and ends that
+            contradict one another.
     """
     _check_shapes(paths)
     for name in DIMENSIONS:
@@ -247,3 +253,41 @@ def _check_physics(paths: PathSet) -> None:
         value = np.asarray(getattr(paths, name))[mask]
         if value.size and value.min() <= 0:
             raise InputError(f"paths.{name}", "positive values", f"{value.min():.6g}", _REMEDY)
+    _check_lengths(paths, mask)
+
+
+def _check_lengths(paths: PathSet, mask: np.ndarray) -> None:
+    """Refuse delays, lengths, carrier phasors and ends that contradict one another, as where a unit is another one."""
+    length, delay = np.asarray(paths.length, float), np.asarray(paths.delay, float)
+    ends = np.asarray(paths.rx_position) - np.asarray(paths.tx_position)
+    straight = np.broadcast_to(np.linalg.norm(ends, axis=-1)[:, None], mask.shape)
+    travelled = delay * speed_of_light
+    turned = np.exp(-2j * np.pi * np.mod(paths.frequency * delay, 1.0))
+    # delays in single precision keep a millionth of the turns
+    allowed = _TURNED + 2e-6 * np.pi * paths.frequency * delay
+    for name, wrong, expected, got in (
+        (
+            "delay",
+            np.abs(travelled - length) > _OFF * length,
+            "s, the path's length over the speed of light",
+            delay,
+        ),
+        (
+            "length",
+            length < straight * (1 - _OFF),
+            "m, no less than from end to end in a straight line",
+            length,
+        ),
+        (
+            "carrier_phasor",
+            np.abs(turned - np.asarray(paths.carrier_phasor)) > allowed,
+            "exp(-2j pi f tau) of the path's delay and the carrier",
+            paths.carrier_phasor,
+        ),
+    ):
+        if np.any(wrong & mask):
+            link, path = map(int, np.argwhere(wrong & mask)[0])
+            value = f"{np.asarray(got)[link, path]:.4g} for path {path} of link {link} ({length[link, path]:.4g} m long)"
+            raise InputError(
+                f"paths.{name}", expected, value, "Check units and links, and make it of them again"
+            )

@@ -51,6 +51,22 @@ WRONG = {
     "material": (lambda p: {"object_material": p.object_material - 1}, "indices from 0 to 2"),
     "direction": (lambda p: {"arrival": 2 * p.arrival}, "unit vectors"),
     "length": (lambda p: {"length": -p.length}, "positive values"),
+    "delay in ns": (
+        lambda p: {"delay": 1e9 * p.delay},
+        "paths.delay: expected s, the path's length over the speed of",
+    ),
+    "other ends": (
+        lambda p: {"rx_position": p.rx_position + 50.0},
+        "paths.length: expected m, no less than from end",
+    ),
+    "carrier": (
+        lambda p: {"frequency": 1.1 * p.frequency},
+        "paths.carrier_phasor: expected .* got .* for path 0 of",
+    ),
+    "conjugate": (
+        lambda p: {"carrier_phasor": p.carrier_phasor.conj()},
+        "paths.carrier_phasor: expected exp",
+    ),
     "frequency": (lambda _: {"frequency": 0.0}, "positive carrier"),
 }
 
