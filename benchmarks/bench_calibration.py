@@ -123,7 +123,7 @@ def measurement(side: int, tones: int) -> tuple[Statistics, float]:
 def calibration(statistics: Statistics, noise_power: float) -> Callable[[], Any]:
     """A calibration of all steps."""
     paths = urban.scene()[1].calibration
-    settings = Settings(iterations=STEPS, law="half_space")
+    settings = Settings(iterations=STEPS, concentration=1.0, law="half_space")
     return lambda: jax.block_until_ready(calibrate(paths, statistics, noise_power, settings=settings))
 
 

@@ -202,7 +202,10 @@ def calibrations(runs: Sequence[Statistics], ratio_db: float = SNR_DB) -> dict[S
     noise_power = jnp.full(len(runs), truth.noise_power(ratio_db))
     return {
         scheme: calibrate_runs(
-            twin.calibration, stacked, noise_power, settings=Settings(scheme, law="half_space")
+            twin.calibration,
+            stacked,
+            noise_power,
+            settings=Settings(scheme, concentration=1.0, law="half_space"),
         )
         for scheme in SCHEMES
     }

@@ -107,7 +107,9 @@ def _outcome(
     channel = truth[_CALIBRATING][:, None, None, None] + noise
     statistics = [project(calibrating, jnp.asarray(frequency), jnp.asarray(one)) for one in channel]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *statistics)
-    settings = Settings(scheme, permittivity=START.permittivity, conductivity=START.conductivity)
+    settings = Settings(
+        scheme, permittivity=START.permittivity, conductivity=START.conductivity, concentration=1.0
+    )
     found = calibrate_runs(calibrating, together, jnp.full(runs, noise_power), settings=settings)
     each = [jax.tree.map(lambda leaf, i=i: leaf[i], found) for i in range(runs)]
     measured = profile(truth[_TESTED], frequency)[1]
