@@ -19,7 +19,7 @@ def check_tones(frequency: Float[np.ndarray, " subcarrier"], carrier: float | No
         carrier: in Hz, where it is known.
 
     Raises:
-        InputError: several at one frequency or within 1 kHz, or frequencies that count from zero.
+        InputError: several at one frequency or within 1 kHz, frequencies that count from zero, or below 0 Hz.
     """
     if len(frequency) > 1 and np.ptp(frequency) < _NARROWEST:
         got = f"{len(frequency)} within {np.ptp(frequency):g} Hz of {frequency[0]:g} Hz"
@@ -28,3 +28,9 @@ def check_tones(frequency: Float[np.ndarray, " subcarrier"], carrier: float | No
     if carrier is not None and len(frequency) and frequency.min() > carrier / 2:
         expected, got = f"Hz from the carrier, {carrier:g} Hz", f"{frequency.min():g} Hz and more"
         raise InputError("subcarrier_frequency", expected, got, "Subtract the carrier")
+    if carrier is not None and len(frequency) and frequency.min() <= -carrier:
+        got, remedy = (
+            f"{frequency.min():g} Hz",
+            "Give each subcarrier's own frequency in Hz, from the carrier",
+        )
+        raise InputError("subcarrier_frequency", f"above -{carrier:g} Hz, minus the carrier", got, remedy)

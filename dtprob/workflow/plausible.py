@@ -8,11 +8,21 @@ from scipy.constants import speed_of_light
 from scipy.spatial.distance import pdist
 
 from dtprob.data import ChannelData, PowerData
+from dtprob.raytracing.paths import PathSet
 
 _SPARSE: Final = 2.0
 """Wavelengths between nearest elements from which an array looks as if it were not in metres."""
 _LOUD: Final = 10.0
 """How often the measured power, its noise included, the noise power may be."""
+
+_MIRRORED: Final = 0.5
+"""How much less than of the channel its paths may leave of its conjugate."""
+_UNEXPLAINED: Final = 0.05
+"""Share of the channel's energy below which its paths explain it well enough."""
+_LOOKED_AT: Final = 16
+"""Links, and snapshots of each, of which that is looked at, about."""
+_SMALLEST: Final = 1e-9
+"""Directions of the paths' span below this share of the largest say nothing."""
 
 
 def doubts(data: ChannelData | PowerData, frequency: float) -> Iterator[str]:
@@ -39,6 +49,45 @@ def doubts(data: ChannelData | PowerData, frequency: float) -> Iterator[str]:
                 f"noise_power is {10 * np.log10(ratio):.0f} dB above the power that was measured with it: "
                 "is it linear, and in the unit of the data?"
             )
+
+
+def mirrored(data: ChannelData | PowerData, paths: PathSet) -> Iterator[str]:
+    """A line where the channel looks as if it were of the other sign of phases.
+
+    Args:
+        data: what was measured.
+        paths: of its links.
+    """
+    if isinstance(data, ChannelData):
+        own, conjugated = (_left(data, paths, conjugate=conjugate) for conjugate in (False, True))
+        if own > _UNEXPLAINED and conjugated < _MIRRORED * own:
+            yield (
+                f"the paths leave {own:.0%} of the channel unexplained, and {conjugated:.0%} of its "
+                "conjugate: a delay tau has to turn it by exp(-2j pi f tau), so should it be conjugated?"
+            )
+
+
+def _left(data: ChannelData, paths: PathSet, *, conjugate: bool) -> float:
+    """The share of the energy of a few links that no amplitudes of their paths explain."""
+    total = explained = 0.0
+    centre = np.zeros((1, 3))
+    for link in range(0, paths.n_link, -(-paths.n_link // _LOOKED_AT)):
+        there = np.asarray(paths.mask)[link]
+        measured = data.channel[link, :_LOOKED_AT]
+        waves = [
+            (-1.0 / paths.wavelength, centre if data.rx_array is None else data.rx_array, paths.arrival),
+            (1.0 / paths.wavelength, centre if data.tx_array is None else data.tx_array, paths.departure),
+        ]
+        turns = [scale * np.asarray(along)[link][there] @ array.T for scale, array, along in waves]
+        turns.append(-np.asarray(paths.delay)[link][there, None] * data.subcarrier_frequency)
+        rx, tx, tone = (np.exp(2j * np.pi * each) for each in turns)
+        gram = np.prod([part.conj() @ part.T for part in (rx, tx, tone)], axis=0)
+        found = np.conj(measured) if conjugate else measured
+        product = np.einsum("srtk,pr,pt,pk->sp", found, rx.conj(), tx.conj(), tone.conj(), optimize=True)
+        solved = product @ np.linalg.pinv(gram, _SMALLEST, hermitian=True).T
+        explained += float(np.sum(np.real(solved * product.conj())))
+        total += float(np.sum(np.abs(measured) ** 2))
+    return max(1.0 - explained / total, 0.0) if total else 1.0
 
 
 def strayed(data: ChannelData | PowerData, scene: Any) -> Iterator[str]:

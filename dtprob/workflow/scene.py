@@ -25,7 +25,7 @@ from dtprob.raytracing import storage
 from dtprob.raytracing.beyond import strongest, with_beyond
 from dtprob.raytracing.carrier import check_carrier
 from dtprob.raytracing.paths import PathSet
-from dtprob.workflow.plausible import doubts, strayed
+from dtprob.workflow.plausible import doubts, mirrored, strayed
 
 _WALL_THICKNESS = 0.12
 _APART = 1e-2
@@ -64,7 +64,7 @@ def reached[Links: ChannelData | PowerData](
         InputError: see `paths_of`; or a link that no path reaches, unless the case asks to skip it.
     """
     paths = paths_of(case, data, cache, say)
-    for doubt in doubts(data, paths.frequency):
+    for doubt in (*doubts(data, paths.frequency), *mirrored(data, paths)):
         say(f"note: {doubt}")
     found = np.asarray(paths.mask).any(axis=1)
     if found.all():
@@ -281,6 +281,9 @@ def _same_links(paths: PathSet, data: ChannelData | PowerData, case: Case) -> Pa
         if traced.shape != measured.shape or not np.allclose(traced, measured, rtol=0.0, atol=1e-3):
             where = f"{case.path.name} [scene] file: {name}"
             expected = f"the {len(measured)} positions of the data, to 1 mm"
-            got = f"{len(traced)} positions" + ("" if traced.shape != measured.shape else " elsewhere")
-            raise InputError(where, expected, got, "Trace the scene again for these data")
+            got = f"{len(traced)} positions"
+            if traced.shape == measured.shape:
+                apart = np.linalg.norm(traced - measured, axis=1)
+                got += f", that of link {np.argmax(apart)} {apart.max():.3g} m away"
+            raise InputError(where, expected, got, "Trace the scene again for these data, link by link")
     return paths

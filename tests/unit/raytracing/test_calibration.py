@@ -271,6 +271,7 @@ def test_bad_input_is_named(paths, array):
             {"subcarrier_frequency": TONES + 3.5e9},
             "Hz from the carrier, 3.5e.09 Hz, got .* Subtract the carrier",
         ),
+        ({"subcarrier_frequency": TONES * 1e9}, "above -3.5e.09 Hz, minus the carrier, got -1.5e.17 Hz"),
         ({"subcarrier_frequency": TONES / 1e9}, "different frequencies, got 16 within 0.3 Hz"),
     ):
         right = {"paths": paths, "subcarrier_frequency": TONES, "channel": h}

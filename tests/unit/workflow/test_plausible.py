@@ -8,7 +8,9 @@ import pytest
 from dtprob.case import SceneSection
 from dtprob.data import ChannelData, PowerData
 from dtprob.errors import InputError
-from dtprob.workflow.plausible import doubts, strayed
+from dtprob.raytracing.field import frequency_response, path_gain, steering, synthesize
+from dtprob.testing.room import room_paths
+from dtprob.workflow.plausible import doubts, mirrored, strayed
 from dtprob.workflow.scene import paths_of
 
 CARRIER = 3e9
@@ -52,6 +54,31 @@ def test_noise_above_the_powers_is_told():
         PowerData(power=np.full((3, 1, 1), 1e-9), noise_power=np.float64(1e-6), **places), CARRIER
     )
     assert "noise_power is 30 dB above" in doubt
+
+
+@pytest.mark.parametrize(("tones", "antennas"), [(32, 1), (16, 4), (1, 1)])
+def test_conjugated_channels_are_told_and_no_others(tones, antennas):
+    paths = room_paths(20, 6)
+    frequency = 4e6 * (np.arange(tones) - (tones - 1) / 2)
+    array = np.outer(np.arange(antennas) - (antennas - 1) / 2, [0.0, paths.wavelength / 2, 0.0])
+    gain = path_gain(paths, paths.permittivity, paths.conductivity)
+    there = steering(array, paths.arrival, paths.frequency, -1.0)
+    noiseless = np.asarray(synthesize(gain, frequency_response(paths, frequency), there))
+    rng = np.random.default_rng(2)
+    noise = rng.normal(size=(2, 20, 3, antennas, 1, tones)) * np.sqrt(np.mean(np.abs(noiseless) ** 2) / 20)
+    right = noiseless + noise[0] + 1j * noise[1]
+    ends = {"rx_position": np.asarray(paths.rx_position), "tx_position": np.asarray(paths.tx_position)}
+
+    def said(channel):
+        data = ChannelData(channel=channel, subcarrier_frequency=frequency, rx_array=array, **ends)
+        return list(mirrored(data, paths))
+
+    assert not said(right)
+    assert not said(right[rng.permutation(20)])
+    assert not said(np.zeros_like(right))
+    told = said(right.conj())
+    assert len(told) == (tones > 1)
+    assert all("of its conjugate: a delay tau has to turn it by exp(-2j pi f tau)" in line for line in told)
 
 
 def test_ends_outside_of_the_scene_are_told():
