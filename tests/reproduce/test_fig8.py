@@ -127,7 +127,11 @@ def test_the_expected_profile_is_the_mean_over_phase_errors():
 
     def expected(concentration):
         found = Calibration(
-            *(jnp.full(2, value) for value in gain), jnp.asarray(concentration), jnp.ones(3), jnp.zeros(1)
+            *(jnp.full(2, value) for value in gain),
+            jnp.asarray(concentration),
+            jnp.ones(3),
+            jnp.zeros(1),
+            jnp.zeros(()),
         )
         return expected_profile(paths, found, FREQUENCY, 2)[1]
 

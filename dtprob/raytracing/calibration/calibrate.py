@@ -31,6 +31,8 @@ class Calibration(NamedTuple):
         concentration: of the phase errors; infinity for "oblivious", 0 for "uniform", which assume so.
         noise_power: as given, or as estimated.
         loss: that of the scheme before each iteration.
+        free_energy: E[log q] - E[log p] at the end, nats, by which the aware schemes' answers from several starts compare;
+            NaN for "oblivious" and "uniform", whose last loss does.
     """
 
     permittivity: Float[Array, " object"]
@@ -38,6 +40,7 @@ class Calibration(NamedTuple):
     concentration: Float[Array, ""]
     noise_power: Float[Array, " link"]
     loss: Float[Array, " iteration"]
+    free_energy: Float[Array, ""]
 
 
 class _Task(eqx.Module):
@@ -172,18 +175,18 @@ def _runs(task: _Task, statistics: Statistics, noise_power: Float[Array, "run li
 def _calibrate(task: _Task, statistics: Statistics, noise_power: Float[Array, " link"]) -> Calibration:
     """From each concentration that the settings name; the answer of the lowest free energy is kept."""
 
-    def arrive(concentration: Array) -> tuple[Calibration, Array]:
+    def arrive(concentration: Array) -> Calibration:
         return _calibrate_from(concentration, task, statistics, noise_power)
 
-    found, energy = lax.map(arrive, jnp.asarray(task.settings.starts, statistics.energy.dtype))
-    best = jnp.argmin(jnp.where(jnp.isnan(energy), jnp.inf, energy))
+    found = lax.map(arrive, jnp.asarray(task.settings.starts, statistics.energy.dtype))
+    best = jnp.argmin(jnp.where(jnp.isnan(found.free_energy), jnp.inf, found.free_energy))
     return jax.tree.map(lambda leaf: leaf[best], found)
 
 
 def _calibrate_from(
     concentration: Array, task: _Task, statistics: Statistics, noise_power: Float[Array, " link"]
-) -> tuple[Calibration, Array]:
-    """One search, and the free energy where it ends."""
+) -> Calibration:
+    """One search."""
     settings = task.settings
     optimiser = optax.chain(optax.clip_by_global_norm(settings.clip), optax.adam(settings.rate))
 
@@ -215,8 +218,8 @@ def _calibrate_from(
     state, losses = lax.scan(step, state, jnp.arange(settings.steps))
     assumed = {"oblivious": jnp.inf, "uniform": 0.0}.get(settings.scheme)
     found = state.concentration if assumed is None else jnp.asarray(assumed, kind)
-    answer = Calibration(*task.materials(state.coordinates), found, state.noise_power, losses)
-    return answer, _free_energy(task, state, statistics) if assumed is None else jnp.zeros((), kind)
+    energy = _free_energy(task, state, statistics) if assumed is None else jnp.asarray(jnp.nan, kind)
+    return Calibration(*task.materials(state.coordinates), found, state.noise_power, losses, energy)
 
 
 def _free_energy(task: _Task, state: _State, statistics: Statistics) -> Array:
