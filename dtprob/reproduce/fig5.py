@@ -74,7 +74,7 @@ def _errors(key: PRNGKeyArray, runs: int, bandwidth: float) -> dict[str, Float[n
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *found)
     errors: dict[str, np.ndarray] = {}
     for scheme in SCHEMES:
-        settings = Settings(scheme, concentration=1.0, law="half_space")
+        settings = Settings(scheme, law="half_space")
         result = calibrate_runs(twin, stacked, jnp.full(runs, noise_power), settings=settings)
         powers = jax.vmap(lambda e, s: _power(twin, e, s))(result.permittivity, result.conductivity)
         errors[scheme] = np.abs(np.asarray(powers) / power - 1)
