@@ -11,6 +11,7 @@ import xarray as xr
 from dtprob.gap.evidence import Evidence
 from dtprob.gap.how_far.expected import expected_loss
 from dtprob.gap.where.closed_share import ClosedShare
+from dtprob.raytracing.paths import path_set_among
 
 _PATHS = "path_gain"
 """The site that has an entry for each path."""
@@ -98,7 +99,7 @@ def _differences(evidence: Evidence) -> dict[str, xr.Dataset]:
 def _paths(evidence: Evidence) -> dict[str, xr.Dataset]:
     """Each path of a traced scene with what it carries of the gap, and where it goes; nothing without a scene."""
     before, after = (at.entries.get(_PATHS) for at in (evidence.before, evidence.after))
-    traced = next((v for v in evidence.problem.data.values() if hasattr(v, "vertex")), None)
+    traced = path_set_among(evidence.problem.data)
     if traced is None or before is None or after is None or before.shape != traced.mask.shape:
         return {}
     if traced.interaction.size > _MOST_STEPS:

@@ -1,5 +1,6 @@
 """The propagation paths of a traced scene, as one frozen pytree that needs no ray tracer."""
 
+from collections.abc import Mapping
 from typing import Any, Final
 
 import equinox as eqx
@@ -190,6 +191,11 @@ DIMENSIONS: Final[dict[str, tuple[str, ...]]] = {
 """The axes of every array of a `PathSet`."""
 
 _REMEDY: Final = "Trace the scene again, or correct the array"
+
+
+def path_set_among(data: Mapping[str, Any]) -> PathSet | None:
+    """The path set among a model's arguments, whatever it is called there; None where there is none."""
+    return next((value for value in data.values() if isinstance(value, PathSet)), None)
 
 
 def validate(paths: PathSet) -> PathSet:

@@ -3,11 +3,13 @@
 from collections.abc import Iterator
 from typing import Any, Final
 
+import jax.numpy as jnp
 import numpy as np
 from scipy.constants import speed_of_light
 from scipy.spatial.distance import pdist
 
 from dtprob.data import ChannelData, PowerData
+from dtprob.raytracing.calibration import project
 from dtprob.raytracing.paths import PathSet
 
 _SPARSE: Final = 2.0
@@ -59,7 +61,7 @@ def mirrored(data: ChannelData | PowerData, paths: PathSet) -> Iterator[str]:
         paths: of its links.
     """
     if isinstance(data, ChannelData):
-        own, conjugated = (_left(data, paths, conjugate=conjugate) for conjugate in (False, True))
+        own, conjugated = _left(data, paths)
         if own > _UNEXPLAINED and conjugated < _MIRRORED * own:
             yield (
                 f"the paths leave {own:.0%} of the channel unexplained, and {conjugated:.0%} of its "
@@ -67,27 +69,20 @@ def mirrored(data: ChannelData | PowerData, paths: PathSet) -> Iterator[str]:
             )
 
 
-def _left(data: ChannelData, paths: PathSet, *, conjugate: bool) -> float:
-    """The share of the energy of a few links that no amplitudes of their paths explain."""
-    total = explained = 0.0
-    centre = np.zeros((1, 3))
-    for link in range(0, paths.n_link, -(-paths.n_link // _LOOKED_AT)):
-        there = np.asarray(paths.mask)[link]
-        measured = data.channel[link, :_LOOKED_AT]
-        waves = [
-            (-1.0 / paths.wavelength, centre if data.rx_array is None else data.rx_array, paths.arrival),
-            (1.0 / paths.wavelength, centre if data.tx_array is None else data.tx_array, paths.departure),
-        ]
-        turns = [scale * np.asarray(along)[link][there] @ array.T for scale, array, along in waves]
-        turns.append(-np.asarray(paths.delay)[link][there, None] * data.subcarrier_frequency)
-        rx, tx, tone = (np.exp(2j * np.pi * each) for each in turns)
-        gram = np.prod([part.conj() @ part.T for part in (rx, tx, tone)], axis=0)
-        found = np.conj(measured) if conjugate else measured
-        product = np.einsum("srtk,pr,pt,pk->sp", found, rx.conj(), tx.conj(), tone.conj(), optimize=True)
-        solved = product @ np.linalg.pinv(gram, _SMALLEST, hermitian=True).T
-        explained += float(np.sum(np.real(solved * product.conj())))
-        total += float(np.sum(np.abs(measured) ** 2))
-    return max(1.0 - explained / total, 0.0) if total else 1.0
+def _left(data: ChannelData, paths: PathSet) -> tuple[float, float]:
+    """The shares of the energy of a few links, and of their conjugates, that no amplitudes of their paths explain."""
+    links = np.arange(0, paths.n_link, -(-paths.n_link // _LOOKED_AT))
+    measured = data.channel[links, :_LOOKED_AT]
+    both = np.concatenate([measured, np.conj(measured)], axis=1)
+    arrays: dict[str, Any] = {"rx_array": data.rx_array, "tx_array": data.tx_array}
+    frequency: Any = data.subcarrier_frequency
+    seen = project(paths.take(links), frequency, jnp.asarray(both), **arrays, powers=False)
+    product = np.asarray(seen.product)
+    solved = product @ np.linalg.pinv(np.asarray(seen.gram), _SMALLEST, hermitian=True).transpose(0, 2, 1)
+    explained = np.real(solved * product.conj()).sum(axis=(0, 2)).reshape(2, -1).sum(axis=1)
+    total = np.sum(np.abs(measured) ** 2)
+    own, conjugated = np.maximum(1.0 - explained / total, 0.0) if total else np.ones(2)
+    return float(own), float(conjugated)
 
 
 def strayed(data: ChannelData | PowerData, scene: Any) -> Iterator[str]:

@@ -11,6 +11,7 @@ from scipy import stats
 
 from dtprob.gap.where.families import Site
 from dtprob.gap.where.family_test import FamilyTest
+from dtprob.raytracing.paths import path_set_among
 
 _MOST: Final = 0.6
 """Share of what is more than chance that an entry has to bring; of two groups each brings a half."""
@@ -24,7 +25,7 @@ type Names = Mapping[str, Sequence[str]]
 
 def names_of_entries(data: Mapping[str, Any]) -> Names:
     """Of the objects of a traced scene in a model's data; of no other axis."""
-    traced = next((value for value in data.values() if hasattr(value, "object_names")), None)
+    traced = path_set_among(data)
     return {} if traced is None else {"object": traced.object_names}
 
 

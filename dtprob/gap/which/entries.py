@@ -139,8 +139,7 @@ class Trials:
         counts = [_count(terms) for terms in self.lines.terms]
         spread = plausible_spread(self.effect)
         spacing = 2 * _ALONE * spread / np.maximum(np.array(counts) - 1, 1)
-        within = 2 * np.floor(_REACH * spread / spacing + 1e-9).astype(int) + 1
-        counts = [min(count, int(most)) for count, most in zip(counts, within, strict=True)]
+        counts = np.minimum(counts, 2 * np.floor(_REACH * spread / spacing + 1e-9).astype(int) + 1).tolist()
         most = min(_TRIALS, max(_WORK // (self.problem.observed.count * len(self._turns)), _LINE))
         while np.prod(counts) > most:
             counts[int(np.argmax(counts))] -= 2

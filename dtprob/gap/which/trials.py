@@ -90,12 +90,7 @@ def remembered(before: View, trials: Trials, seen: View) -> dict[str, Found]:
     """
     gain = {name: one.log_evidence - before.fitted.log_evidence for name, one in trials.fits.items()}
     least = max(_WORTH, _MUCH * max(gain.values(), default=0.0))
-    able = {e.name: e for e in seen.problem.effects if e.kind == "mean" and e.name not in seen.fitted.effects}
-    most = sorted(
-        (name for name in gain if name in able and gain[name] > least), key=lambda name: -gain[name]
-    )
-    index = {name: trials.problem.layout.of(able[name]) for name in most[:_REMEMBERED]}
-    return {name: Found(gain[name], seen.fitted.x, trials.fits[name].x[at]) for name, at in index.items()}
+    return _first(_reached(trials, {name: nats for name, nats in gain.items() if nats > least}, seen))
 
 
 def as_good(name: str, before: Iterable[Trials], seen: View) -> dict[str, Found]:
@@ -108,15 +103,28 @@ def as_good(name: str, before: Iterable[Trials], seen: View) -> dict[str, Found]
         before: refits at earlier steps.
         seen: the fit beside which it is looked at again.
     """
-    able = {e.name: e for e in seen.problem.effects if e.kind == "mean" and e.name not in seen.fitted.effects}
     found: dict[str, Found] = {}
     for trials in (one for one in before if name in one.fits):
-        worth = {n: one.log_evidence - trials.fits[name].log_evidence for n, one in trials.fits.items()}
-        for rival in (n for n in worth if n in able and n != name and worth[n] > -_AS_GOOD):
-            at = trials.problem.layout.of(able[rival])
-            found[rival] = Found(worth[rival], seen.fitted.x, trials.fits[rival].x[at])
-    most = sorted(found, key=lambda rival: -found[rival].gain)
-    return {rival: found[rival] for rival in most[:_REMEMBERED]}
+        short = {n: one.log_evidence - trials.fits[name].log_evidence for n, one in trials.fits.items()}
+        rivals = {n: nats for n, nats in short.items() if n != name and nats > -_AS_GOOD}
+        found |= _reached(trials, rivals, seen)
+    return _first(found)
+
+
+def _reached(trials: Trials, gain: Mapping[str, float], seen: View) -> dict[str, Found]:
+    """Those of some mean effects that a fit is without, at the sizes of their refits."""
+    able = (e for e in seen.problem.effects if e.kind == "mean" and e.name not in seen.fitted.effects)
+    return {
+        e.name: Found(gain[e.name], seen.fitted.x, trials.fits[e.name].x[trials.problem.layout.of(e)])
+        for e in able
+        if e.name in gain
+    }
+
+
+def _first(found: Mapping[str, Found]) -> dict[str, Found]:
+    """Those that gained most, the best first."""
+    most = sorted(found, key=lambda name: -found[name].gain)
+    return {name: found[name] for name in most[:_REMEMBERED]}
 
 
 def tried(

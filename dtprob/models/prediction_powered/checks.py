@@ -40,8 +40,7 @@ def finite(name: str, array: np.ndarray) -> np.ndarray:
         place = tuple(int(i) for i in np.argwhere(bad)[0])
         shown = place[0] if len(place) == 1 else place
         got = f"{array[place]} at index {shown}"
-        remedy = "Move samples without a label to the unlabelled ones" if name == "y" else "Remove the sample"
-        raise InputError(name, "finite numbers", got, remedy)
+        raise InputError(name, "finite numbers", got, _without(name))
     return array
 
 
@@ -49,8 +48,12 @@ def check_mask(name: str, value: Any) -> None:
     """Refuse what is masked: as plain numbers it would count."""
     if np.ma.is_masked(value):
         first = int(np.argwhere(np.ma.getmaskarray(value))[0][0])
-        remedy = "Move samples without a label to the unlabelled ones" if name == "y" else "Remove the sample"
-        raise InputError(name, "values that are there", f"a masked one in row {first}", remedy)
+        raise InputError(name, "values that are there", f"a masked one in row {first}", _without(name))
+
+
+def _without(name: str) -> str:
+    """What to do about a sample that lacks a value."""
+    return "Move samples without a label to the unlabelled ones" if name == "y" else "Remove the sample"
 
 
 def check_columns(x: Any, other: Any) -> None:

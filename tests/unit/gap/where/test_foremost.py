@@ -1,5 +1,6 @@
 """Which entry of a family of a wrong site is named: the one that brings most of what is wrong, if one does."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import jax
@@ -14,6 +15,7 @@ from dtprob.gap.where.families import Family, Pattern
 from dtprob.gap.where.family_test import FamilyTest
 from dtprob.gap.where.foremost import foremost, names_of_entries
 from dtprob.inference import Laplace
+from dtprob.testing.room import room_paths
 from tests.unit.gap.examples import of_access_points
 
 READINGS = 120
@@ -37,7 +39,7 @@ def test_the_entry_that_brings_most_is_named():
 
 
 def test_objects_of_a_scene_are_called_by_their_names():
-    scene = SimpleNamespace(object_names=("floor", "wall_a", "wall_b"))
+    scene = replace(room_paths(2, 1), object_names=("floor", "wall_a", "wall_b"))
     names = names_of_entries({"level": np.zeros(3), "paths": scene})
     scores = np.array([0.3, -0.5, 9.0])
     family = Family("additive", Pattern("object", (0,)), np.ones(()))
